@@ -106,7 +106,7 @@ peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready $(FOXGLOVE)/.ready $(GRAFA
 wheels: setup
 	$(BIN)/python -m benchmarks.wheels
 
-## make accept  a hundred oracle episodes of every task, and what repeats laws of make test at more sizes (about ten minutes)
+## make accept  a hundred oracle episodes of every task, longer journeys, and what repeats laws of make test at more sizes
 accept: setup
 	$(BIN)/python -m pytest -q -m acceptance
 
@@ -118,7 +118,7 @@ soak: setup
 images: setup
 	$(BIN)/python -m benchmarks.images
 
-## make policy  trains the laptop pair, a slice of MINUTES at a time; keeps data and checkpoints in POLICY_DIR, outside of here; TASKS: some
+## make policy  trains the laptop pair, a slice of MINUTES at a time; keeps data and checkpoints in POLICY_DIR, outside of here; TASKS="A B": of these tasks alone
 MINUTES ?= 150
 POLICY_DIR ?= $(HOME)/ponderpounce-policy
 policy: setup

@@ -44,7 +44,7 @@ class PolicyOptions:
     minutes: float = 150.0
     """Length of this slice."""
     tasks: tuple[Task, ...] = TASKS
-    """Tasks of data, plays and table, the same in every slice. Two take half of the hours and show less."""
+    """Tasks of data, plays and table, the same in every slice. Fewer take fewer hours and show less."""
 
 
 @command("policy")

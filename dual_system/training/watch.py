@@ -92,16 +92,19 @@ class Watch:
 
 def samples_of(row: Row, predicted_N: Tensor, vocabulary: Vocabulary) -> list[Sample]:
     """The row's distinct supervised spans. ``predicted_N``: see `JointLoss`; this row's positions come first."""
-    places = np.flatnonzero(np.asarray(row.targets) != IGNORE)
-    predicted = predicted_N[: len(places)].tolist()
-    if not len(predicted):
-        return []
+    targets = [target for target in row.targets if target != IGNORE]
+    predicted = predicted_N[: len(targets)].tolist()
     found: dict[Sample, None] = {}
-    starts = [0, *(np.flatnonzero(np.diff(places) > 1) + 1).tolist(), len(places)]
-    for start, stop in pairwise(starts):
-        target = vocabulary.decode([row.targets[place] for place in places[start:stop].tolist()])
+    for start, stop in supervised_spans(row) if predicted else ():
+        target = vocabulary.decode(targets[start:stop])
         found[Sample(target=target, predicted=vocabulary.decode(predicted[start:stop]))] = None
     return list(found)
+
+
+def supervised_spans(row: Row) -> list[tuple[int, int]]:
+    """Where each run of neighbouring targets begins and ends, among the row's supervised tokens."""
+    places = row.supervised_index
+    return [*pairwise([0, *(np.flatnonzero(np.diff(places) > 1) + 1).tolist(), len(places)])] if len(places) else []
 
 
 def _cut(path: Path, step: int) -> TextIO:

@@ -4,14 +4,13 @@ Its row has the recorded texts, so each token is predicted behind the right ones
 scenes by heart has a loss near zero there and says wrong places here: every cognition of such a PONDER is lost work.
 """
 
-# N supervised tokens of an episode
+# T tokens of a row, N of them supervised, V vocabulary
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from tqdm import tqdm
 
 from dual_system.analysis.markdown import markdown
 from dual_system.models.ponder.checkpoint import load_ponder
-from dual_system.models.ponder.context import IGNORE, Row
+from dual_system.models.ponder.context import Row
 from dual_system.models.ponder.coordinates import XY_1000
 from dual_system.models.ponder.network import Ponder
 from dual_system.training.collate import collate_ponder
@@ -29,6 +28,7 @@ from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.diagnose import EVERY_INVOCATION, in_turns
 from dual_system.training.example import make_example
 from dual_system.training.joint import encode_rows
+from dual_system.training.watch import supervised_spans
 from protocol import files
 from protocol.command_line import command, parse
 
@@ -113,7 +113,7 @@ def _add(found: Found, row: Row, logits_NV: torch.Tensor, ponder: Ponder) -> Non
     targets_N = torch.from_numpy(np.asarray(row.targets)[row.supervised_index + 1])
     found.loss += F.cross_entropy(logits_NV.float(), targets_N, reduction="none").tolist()
     predicted, decode = logits_NV.argmax(dim=-1).tolist(), ponder.format.vocabulary.decode
-    for begin, end in _spans(row):
+    for begin, end in supervised_spans(row):
         wanted, said = targets_N[begin:end].tolist(), predicted[begin:end]
         found.is_told_apart.append(wanted[0] == said[0])
         if len(wanted) > 1:
@@ -122,12 +122,6 @@ def _add(found: Found, row: Row, logits_NV: torch.Tensor, ponder: Ponder) -> Non
             found.is_right_but_places.append(XY_1000.sub("", wanted_text) == XY_1000.sub("", said_text))
             pairs = list(zip(XY_1000.findall(wanted_text), XY_1000.findall(said_text), strict=False))
             found.off += [float(np.hypot(*np.subtract(*np.array(pair, int)))) for pair in pairs]
-
-
-def _spans(row: Row) -> Iterator[tuple[int, int]]:
-    """Where each run of neighbouring targets begins and ends among the row's supervised tokens."""
-    places = np.flatnonzero(np.asarray(row.targets) != IGNORE)
-    yield from pairwise([0, *(np.flatnonzero(np.diff(places) > 1) + 1).tolist(), len(places)])
 
 
 def _cells(found: Found) -> Sequence[str]:
