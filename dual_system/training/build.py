@@ -32,6 +32,7 @@ from dual_system.models.pounce.configs import Config
 from dual_system.models.pounce.family import AnyPounceConfig
 from dual_system.models.pounce.initialise import open_gates, random_pounce
 from dual_system.models.pounce.precision import cast_streams
+from dual_system.models.pounce.reading import require_prompt
 from dual_system.training.data import RobotShape, TrainingSet
 from dual_system.training.joint import JointModel, Trains, runs_ponder
 from dual_system.training.memory_words import MemoryWords
@@ -62,7 +63,7 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
 
     Raises:
         ValueError: pretrained weights are missing or of another robot than the data, PONDER cannot read the pictures'
-            size, or texts that the recipe learns are missing.
+            size, texts that the recipe learns are missing, or a prompt of the data is too long for POUNCE.
         FileNotFoundError: a given folder holds no checkpoint.
     """
     run = replace(run, pounce=for_robot(run.pounce, run.space, data.robot))
@@ -78,6 +79,8 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
     pounce = cast_streams(bundle.model.to(start.device), start.dtype)
     if type(pounce.config) is not type(run.pounce):
         raise ValueError(f"recipe {run.name} is of another action model than {start.pounce} holds")
+    if run.trains != "ponder":
+        _require_prompts(bundle, data)
     if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
         pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
@@ -180,6 +183,14 @@ def _require_same_robot(bundle: PounceBundle, data: TrainingSet, folder: Path) -
             f"{folder} is of another robot than the data: it has {config.num_cameras} cameras "
             f"{', '.join(config.cameras)}, state {dims[0]}, action {dims[1]}; the data have {robot}"
         )
+
+
+def _require_prompts(bundle: PounceBundle, data: TrainingSet) -> None:
+    """Raises ValueError if POUNCE cannot read a prompt of the data: now, and not at the step that first draws it."""
+    config, tokenizer = bundle.model.config, bundle.tokenizer
+    prompts = data.instructions_with_subgoals() if config.reads_subgoal else data.instructions()
+    for each in prompts:
+        require_prompt(each, config, tokenizer)
 
 
 def with_channel(run: Recipe, bundle: PounceBundle) -> PounceBundle:

@@ -178,8 +178,8 @@ class Batches:
             for place in self._places
         ]
         episodes = collate_ponder(examples if self._runs_ponder else [])
-        if run.trains == "ponder":  # POUNCE is not run: one invocation suffices for the batch's shape
-            examples = [replace(each, invocations=each.schedule.invocations[:1], told=("",)) for each in examples]
+        if run.trains == "ponder":
+            examples = [_of_no_prompt(each) for each in examples]
         invocations = collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
         if run.grounds_memory and (sampling := sampling_of(self._pounce)) is not None:
             invocations = replace(invocations, words_IL=words_to_remember(examples, self._form, sampling))
@@ -201,6 +201,12 @@ class Batches:
         """Numbers of the batch's episodes, long ones first, so that the processes' shares have similar lengths."""
         numbers: list[int] = rng.integers(len(self._data), size=self._run.batch_episodes).tolist()
         return sorted(numbers, key=lambda number: -self._data.num_rows(number))
+
+
+def _of_no_prompt(example: Example) -> Example:
+    """One invocation without a prompt, for the batch's shape alone: where POUNCE is not run, no task is too long."""
+    episode = replace(example.episode, instruction="")
+    return replace(example, episode=episode, invocations=example.schedule.invocations[:1], told=("",))
 
 
 @command("pp-train")

@@ -105,6 +105,21 @@ def test_ponder_alone_does_without_pounce(folder: Path, monkeypatch: pytest.Monk
     assert [report.flow_matching for report in reports] == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("name", ["tiny", "tiny_groot"])
+def test_a_prompt_that_pounce_cannot_read_is_found_before_the_first_step(name: str, folder: Path) -> None:
+    run = recipe_for("both", name=name)
+    short = replace(run, pounce=replace(run.pounce, max_prompt_tokens=3))
+    with pytest.raises(ValueError, match=r"prompt has \d+ tokens, expected at most 3 .*shorten the instruction"):
+        trainer_of(short, folder)
+
+
+def test_ponder_alone_learns_from_tasks_that_pounce_cannot_read(folder: Path) -> None:
+    run = recipe_for("ponder")
+    trainer = trainer_of(replace(run, pounce=replace(run.pounce, max_prompt_tokens=40)), folder)
+    twin = trainer_of(run, folder)
+    assert [report.grounding for report in trainer.run(2)] == [report.grounding for report in twin.run(2)]
+
+
 def test_ponder_alone_learns_from_episodes_that_nobody_imitates(folder: Path) -> None:
     """A correction may begin after the last invocation of its schedule."""
     trainer = trainer_of(recipe_for("ponder"), folder)

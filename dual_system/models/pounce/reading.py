@@ -69,10 +69,7 @@ def pi05_inputs(
     frames = through(config.windows, moment.frames, (config.image_px, config.image_px))
     images, has_view = _views(frames, config.image_px, device)
     state = statistics.normalise_states(moment.proprio)
-    has_token = config.state_input == "token"
-    text = _STATELESS[config.stateless_prompt] if has_token else partial(prompt.prompt_text, state=state)
-    token_ids = tokenizer.encode(text(_instruction(moment, config.reads_subgoal)))
-    _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction, 0 if has_token else len(state))
+    token_ids = pi05_prompt(_instruction(moment, config.reads_subgoal), state, config, tokenizer)
     return PounceInputs(
         images=images,
         has_view=has_view,
@@ -80,7 +77,7 @@ def pi05_inputs(
         is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=device),
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
-        state=torch.from_numpy(state)[None].to(device) if has_token else None,
+        state=torch.from_numpy(state)[None].to(device) if config.state_input == "token" else None,
         **_past(moment, config, device),
     )
 
@@ -98,18 +95,9 @@ def groot_inputs(
         ValueError: the prompt is too long, or its image tokens are not one per patch of the frames.
     """
     images, _ = _views(moment.frames, config.image_px, device)
-    num_patches = config.groot.eagle.vision.num_patches
-    instruction = _instruction(moment, config.reads_subgoal)
-    token_ids = tokenizer.encode(groot_prompt.prompt_text(instruction, config.num_cameras, num_patches))
-    num_slots, image_id = config.num_cameras * num_patches, config.groot.eagle.image_token_id
-    if token_ids.count(image_id) != num_slots or images.shape[1] != config.num_cameras:
-        raise ValueError(
-            f"expected {num_slots} image tokens (id {image_id}), one per patch of {config.num_cameras} cameras, came "
-            f"{token_ids.count(image_id)} and {images.shape[1]} frames; the model was saved with another tokenizer.json"
-            " or other cameras"
-        )
-    num_text = len(token_ids) - num_slots
-    _check_length(num_text, config.max_prompt_tokens, moment.instruction)
+    if images.shape[1] != config.num_cameras:
+        raise ValueError(f"expected a frame of each of {config.num_cameras} cameras, came {images.shape[1]}")
+    token_ids = groot_prompt_ids(_instruction(moment, config.reads_subgoal), config, tokenizer)
     state = torch.zeros(1, config.groot.state_dim)
     state[0, : config.robot_state_dim] = torch.from_numpy(statistics.normalise_states(moment.proprio))
     return GrootInputs(
@@ -121,6 +109,39 @@ def groot_inputs(
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
     )
+
+
+def require_prompt(
+    instruction: str, config: PounceConfig | GrootPounceConfig, tokenizer: Tokenizer | EagleTokenizer
+) -> None:
+    """Raises ValueError if POUNCE cannot read an instruction, beside a state in the middle of its range."""
+    if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
+        pi05_prompt(instruction, np.zeros(config.robot_state_dim, dtype=np.float32), config, tokenizer)
+    elif isinstance(config, GrootPounceConfig) and isinstance(tokenizer, EagleTokenizer):
+        groot_prompt_ids(instruction, config, tokenizer)
+
+
+def pi05_prompt(instruction: str, state: Floats, config: PounceConfig, tokenizer: Tokenizer) -> list[int]:
+    """Token ids of the prompt; ``state`` is normalised. Raises ValueError if the prompt is too long."""
+    has_token = config.state_input == "token"
+    text = _STATELESS[config.stateless_prompt] if has_token else partial(prompt.prompt_text, state=state)
+    token_ids = tokenizer.encode(text(instruction))
+    _check_length(len(token_ids), config.max_prompt_tokens, instruction, 0 if has_token else len(state))
+    return token_ids
+
+
+def groot_prompt_ids(instruction: str, config: GrootPounceConfig, tokenizer: EagleTokenizer) -> list[int]:
+    """Token ids of the prompt with an image token a patch. Raises ValueError if it is too long, or has others."""
+    num_patches = config.groot.eagle.vision.num_patches
+    token_ids = tokenizer.encode(groot_prompt.prompt_text(instruction, config.num_cameras, num_patches))
+    num_slots, image_id = config.num_cameras * num_patches, config.groot.eagle.image_token_id
+    if token_ids.count(image_id) != num_slots:
+        raise ValueError(
+            f"expected {num_slots} image tokens (id {image_id}), one per patch of {config.num_cameras} cameras, came "
+            f"{token_ids.count(image_id)}; the model was saved with another tokenizer.json"
+        )
+    _check_length(len(token_ids) - num_slots, config.max_prompt_tokens, instruction)
+    return token_ids
 
 
 def _past(moment: Moment, config: PounceConfig, device: torch.device) -> dict[str, Any]:
