@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit oldest peers wheels accept soak images policy site lint types proto bench clean
+.PHONY: help setup demo test unit oldest peers wheels accept soak images policy kitchen site lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -123,6 +123,11 @@ MINUTES ?= 150
 POLICY_DIR ?= $(HOME)/ponderpounce-policy
 policy: setup
 	$(BIN)/python -m benchmarks.policy --folder "$(POLICY_DIR)" --minutes $(MINUTES) $(if $(TASKS),--tasks $(TASKS))
+
+## make kitchen trains and plays RoboCasa-DC's experiment at laptop size, likewise, in KITCHEN_DIR
+KITCHEN_DIR ?= $(HOME)/ponderpounce-kitchen
+kitchen: setup
+	$(BIN)/python -m benchmarks.kitchen_policy --folder "$(KITCHEN_DIR)" --minutes $(MINUTES)
 
 ## make site    the documents as a site, links checked, in out/site/html
 SITE := $(VENV)/site

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from benchmarks.slices import Stage
 from dual_system.training import laptop_recipes as recipes
 
 Task = Literal["VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes"]
@@ -69,16 +69,6 @@ PROBED_SCENES = 40
 """Development scenes a task on which a probe is fitted and tried."""
 TEST_SCENES, FEW_TEST_SCENES = 100, 50
 """Test scenes a task of the rows of both contrasts and their controls, and of the others."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stage:
-    """Commands, each a module and its arguments, that run side by side."""
-
-    name: str
-    commands: tuple[tuple[str, ...], ...]
-    is_test: bool = False
-    """Whether it plays test scenes, which no run of training may follow."""
 
 
 def stages(folder: Path, tasks: Sequence[str] = TASKS) -> tuple[Stage, ...]:

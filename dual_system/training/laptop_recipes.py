@@ -17,7 +17,7 @@ from dual_system.training.recipe import Recipe
 from dual_system.training.told import Told
 from dual_system.training.trainer import TrainConfig
 
-_LAPTOP = TrainConfig(seed=0, flow_samples=2, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
+LAPTOP = TrainConfig(seed=0, flow_samples=2, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
 _ROW_STEPS = 1_500
 """Steps that every row of the table goes on with, whatever its channel."""
 _DELAYED_STEPS = 300
@@ -41,7 +41,7 @@ def laptop_hand() -> Recipe:
             told=Told(grounded=1 / 3, simple=1 / 3, jitter_px=3.2, far_share=0.25, far_px=12.0),
             branch_weight=3.0,
         ),
-        train=_LAPTOP,
+        train=LAPTOP,
         num_steps=8_000,
         batch_episodes=8,
         w2=0.5,  # of pointing alone: no PONDER is run
@@ -78,7 +78,7 @@ def laptop() -> Recipe:
         freeze="vision",
         freezes_ponder_vision=True,
         example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, branch_weight=3.0),
-        train=_LAPTOP,
+        train=LAPTOP,
         num_steps=_ROW_STEPS,
         batch_episodes=4,  # 16 invocations of each: PONDER's films are what a step costs
         w2=0.3,  # the paper's 0.1 is for a pretrained LM head

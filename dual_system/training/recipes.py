@@ -1,7 +1,8 @@
 """Named recipes, each one complete frozen value: everything that fixes a training run but the data and the machine.
 
 ``robomme`` and ``robocasa_dc`` are the paper's runs, ``robomme_*`` its ablations; ``tiny*`` exercise every part from
-scratch on one CPU core and learn little. ``laptop*`` are the stages of the pair that two CPU cores train.
+scratch on one CPU core and learn little. ``laptop*`` are the stages of the pair that two CPU cores train, ``kitchen*``
+those of RoboCasa-DC's experiment.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from clock.timebase import NS_PER_S
 from dual_system.models.frame_sampling import FrameMemoryConfig, FrameSampling
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.pounce import configs as pounce_configs
-from dual_system.training import laptop_recipes
+from dual_system.training import kitchen_recipes, laptop_recipes
 from dual_system.training.example import ExampleConfig
 from dual_system.training.optim import OptimConfig
 from dual_system.training.recipe import Recipe
@@ -272,6 +273,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         tiny_framesamp,
         tiny_current,
         *laptop_recipes.ALL,
+        *kitchen_recipes.ALL,
     )
 }
 

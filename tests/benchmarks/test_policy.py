@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 
 from benchmarks import policy
-from benchmarks.policy import DONE, FAILED, UNFINISHED, account
 from benchmarks.policy_cost import CostOptions
-from benchmarks.policy_plan import TASKS, Stage, stages
+from benchmarks.policy_plan import TASKS, stages
+from benchmarks.slices import DONE, FAILED, UNFINISHED, Stage, account
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
 from dual_system.data.export import ExportOptions

@@ -4,13 +4,13 @@ The four real sizes have exactly the published number of parameters (without the
 which transformers omits). Source: Qwen3.5 model cards; tests/models checks them on the meta device.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from transformers.models.qwen3_5 import Qwen3_5Config
 
 from dual_system.models.ponder.vocabulary import Vocabulary
-from dual_system.models.windows import LAPTOP_WINDOWS, Box
+from dual_system.models.windows import LAPTOP_WINDOWS, WHOLE, Box
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,6 +158,11 @@ def laptop() -> PonderConfig:
         image_px=(64, 64),
         windows=LAPTOP_WINDOWS,
     )
+
+
+def laptop_kitchen() -> PonderConfig:
+    """`laptop` with whole pictures, of three cameras or of a demonstration's one."""
+    return replace(laptop(), windows=(WHOLE, WHOLE, WHOLE))
 
 
 def qwen35_0p8b() -> PonderConfig:

@@ -79,6 +79,13 @@ def laptop(*, num_carriers: int = 1, cognition_size: int = 160) -> PounceConfig:
     return in_space(network, "ee_delta")
 
 
+def laptop_kitchen(*, num_carriers: int = 1, cognition_size: int = 160) -> PounceConfig:
+    """`laptop` for the kitchen's PandaOmron: three whole views, chunks of 16 rows, and no pointer."""
+    network = laptop(num_carriers=num_carriers, cognition_size=cognition_size)
+    pi05 = replace(network.pi05, action_dim=12, horizon=GROOT_HORIZON)
+    return replace(network, pi05=pi05, windows=(), num_cameras=3, num_pointed=0)
+
+
 def groot_n1_5(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = GROOT_HORIZON) -> GrootPounceConfig:
     """The public GR00T N1.5 (2.72 B with its unused LM head) with a prefix from a 9B PONDER."""
     return GrootPounceConfig(
