@@ -61,7 +61,7 @@ def laptop_hand_corrected() -> Recipe:
 
 def laptop_films() -> Recipe:
     """Stage A1 of the laptop pair's PONDER, after its tower: films of things, and where they are (`policy.films`)."""
-    return replace(laptop_grounding(), name="laptop_films")
+    return replace(laptop_grounding(), name="laptop_films", num_steps=4_000)
 
 
 def laptop_grounding() -> Recipe:
