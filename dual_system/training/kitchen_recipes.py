@@ -18,7 +18,6 @@ from dual_system.training.laptop_recipes import LAPTOP
 from dual_system.training.recipe import Recipe
 from dual_system.training.told import Told
 
-_DROPOUT = 0.15
 _ROW_STEPS = 1_500
 """Steps that every row goes on with from the hand."""
 
@@ -65,7 +64,7 @@ def kitchen() -> Recipe:
         freeze="vision",
         freezes_ponder_vision=True,
         example=ExampleConfig(clocks=sampling.ROBOCASA_DC, is_grounded=False),
-        train=replace(LAPTOP, dropout=_DROPOUT),
+        train=LAPTOP,
         num_steps=_ROW_STEPS,
         batch_episodes=8,
         w2=0.0,
