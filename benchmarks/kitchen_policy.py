@@ -35,7 +35,7 @@ WEIGHTS = Path("benchmarks/reports/kitchen_weights.json")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KitchenPolicyOptions:
-    """Runs the kitchen's experiment; a next one goes on where the last slice ended (exit code 3: there is more)."""
+    """Runs a slice of the kitchen's experiment, from where the last one ended (exit code 3: there is more)."""
 
     folder: Path
     """Where data, checkpoints and the account of hours are kept, outside of the checkout."""

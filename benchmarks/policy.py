@@ -1,6 +1,8 @@
 """``make policy``: trains the laptop pair from nothing, in slices of some minutes (`slices`).
 
-python -m benchmarks.policy --folder POLICY_DIR --minutes 150 [--tasks VideoUnmask PickHighlight]
+    python -m benchmarks.policy --folder POLICY_DIR --minutes 150 [--tasks VideoUnmask PickHighlight]
+
+At the end gates, losses, the table as far as it goes, and the account of hours are printed.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ CONTROL_HZ = 20
 _MAX_JOINT_RAD_S = np.array([2.175] * 4 + [2.61] * 3)
 # At full speed these servos lag by up to 0.26 rad (kd / kp = 0.1 s) and a step of 0.13; the oracles' reach 0.12.
 _MAX_LEAD_RAD = 0.4
-_STATE_MARGIN = np.array([0.05] * 7 + [0.005])  # rad and m: soft joint limits give a little
 _GRIPPER_UNLIMITED = 0.0  # a switch: the hand itself limits how fast it closes; a stick has nothing to limit
 
 
@@ -34,7 +33,7 @@ def simulated_robot(robot: panda.Robot, initial_state: np.ndarray) -> Robot:
         num_proprio=8,
         is_simulated=True,
         max_lead=np.array([_MAX_LEAD_RAD] * 7 + [_GRIPPER_UNLIMITED], np.float32),
-        state_low=(robot.state_low - _STATE_MARGIN).astype(np.float32),
-        state_high=(robot.state_high + _STATE_MARGIN).astype(np.float32),
+        state_low=(robot.state_low - panda.STATE_SLACK).astype(np.float32),
+        state_high=(robot.state_high + panda.STATE_SLACK).astype(np.float32),
         control_hz=CONTROL_HZ,
     )

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import IMAGE_PX, MAX_STEPS, Snapshot, make_environment
+from dual_system.tasks.panda import STATE_SLACK
 from dual_system.tasks.physics import CONTROL_HZ
 from dual_system.tasks.scene import CAMERAS, FRONT
 from dual_system.tasks.task import TaskError, task_names
@@ -40,7 +41,6 @@ NAMESPACE = "ponderpounce"
 Seen = dict[str, NDArray[Any]]
 
 _MAX_SEED = 2**31
-_SLACK_RAD, _SLACK_M = 0.1, 0.01  # joint limits and finger stops are soft
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
@@ -74,10 +74,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._environment = make_environment(task, image_px=image_px, render=cameras, max_steps=sys.maxsize)
         self._picture: NDArray[np.uint8] | None = None
         robot = self._environment.physics.robot
-        slack = np.append(np.full(7, _SLACK_RAD), _SLACK_M)
         picture = spaces.Box(0, 255, (image_px, image_px, 3), np.uint8)
         self._spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(CAMERAS if cameras else (), picture)
-        self._spaces["state"] = _box(robot.state_low - slack, robot.state_high + slack)
+        self._spaces["state"] = _box(robot.state_low - STATE_SLACK, robot.state_high + STATE_SLACK)
         self.observation_space = spaces.Dict(self._spaces)
         # Without a gripper the last entry moves nothing, and Gymnasium wants a space that is not flat.
         self.action_space = _box(robot.action_low, np.append(robot.action_high[:7], 1.0))

@@ -33,6 +33,9 @@ ROBOT_BIT, WORLD_BIT = 2, 1  # contact bits: the robot touches the world, not it
 STIFF_SOLREF, STIFF_SOLIMP = (0.01, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
 
 _FINGER_TARGET_M = (-0.01, 0.04)  # where commands -1 and +1 drive one finger; below 0 means squeezing
+STATE_SLACK = np.array([0.1] * 7 + [0.02])
+"""How far beyond its limits a state (8,) can be measured [rad, m]: limits are soft, and an arm that comes down on a
+thing presses its fingers apart with 100 N and more."""
 STICK_FROM_HAND_M = (0.05, 0.15)  # where it begins, inside the hand, and where its tip is
 
 
