@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any, Literal
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
-from benchmarks.report import Row, lines_of, spread
+from benchmarks.report import Report, Row, lines_of, spread
 from dual_system.analysis.markdown import percent
 from dual_system.analysis.statistics import wilson
 from dual_system.data.kitchen import PairJob, record
@@ -49,6 +49,8 @@ class YieldOptions:
     """Split of the scenes. demo: the objects' instances A, which are trained on; development: those held out, B."""
     pairs: int = 2
     """Number of solved scenes a task also played with pictures and collected as a pair, for their CPU time."""
+    report: bool = False
+    """Write the table to benchmarks/reports as well, for `benchmarks.render`; on a machine that does nothing else."""
 
     def names(self) -> tuple[str, ...]:
         """Returns what is played, each once. Raises TaskError for an unknown name."""
@@ -152,6 +154,12 @@ def begun(options: YieldOptions) -> dict[str, Any]:
 def main(argv: list[str] | None = None) -> int:
     options = parse(YieldOptions, argv, prog="kitchen-yields")
     names, seeds = options.names(), scenes(options.seeds, split=options.split)
+    report = Report(
+        name="kitchen_yields",
+        question="How often do the kitchen's scripts reach their goals, and what do a pair and a step cost?",
+        config=options,
+        warm_up=f"the first {_WARM_UP_STEPS} steps of a scene.",
+    )
     state = begun(options)
     for name in names:
         if name not in state["tasks"]:
@@ -159,7 +167,11 @@ def main(argv: list[str] | None = None) -> int:
             files.folder(options.out.parent)
             write_json(options.out, state)
     found = {name: state["tasks"][name] for name in names}
-    print("\n".join(lines_of(table(found))))
+    rows = table(found)
+    print("\n".join(lines_of(rows)))
+    if options.report:
+        report.add_table("A step has three pictures of 128 px, rendered in software", rows)
+        report.write()
     for name, task in found.items():
         for reason, count in Counter(task["failed"].values()).items():
             where = ", ".join(seed for seed, why in task["failed"].items() if why == reason)

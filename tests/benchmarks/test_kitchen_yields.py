@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from benchmarks import kitchen_yields as module
+from benchmarks import report
+from benchmarks.render import render, reports_in
 from dual_system.tasks.kitchen.catalogue import TASKS
 from dual_system.tasks.kitchen.environment import KitchenEnvironment, instances_of
 from dual_system.tasks.kitchen.goals import GOAL_SETS
@@ -65,6 +67,16 @@ def test_other_scenes_are_not_added_to_a_file(
     assert run(monkeypatch, Script(), tmp_path / "a.json") == 0
     assert run(monkeypatch, Script(), tmp_path / "a.json", "--split", "development") == 2
     assert "was begun with {'seeds': 5, 'split': 'demo', 'pairs': 2}" in capsys.readouterr().err
+
+
+def test_a_report_is_one_that_is_rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "REPORTS", tmp_path / "reports")
+    assert run(monkeypatch, Script(), tmp_path / "a.json") == 0
+    assert not (tmp_path / "reports").exists()
+    assert run(monkeypatch, Script(), tmp_path / "a.json", "--report") == 0
+    page = render(reports_in(tmp_path / "reports"))
+    assert "| OpenDrawer  | 3/5 " in page
+    assert str(tmp_path) not in page
 
 
 def test_a_row_has_the_spread_of_the_steps() -> None:
