@@ -114,9 +114,9 @@ def groot_inputs(
 def require_prompt(
     instruction: str, config: PounceConfig | GrootPounceConfig, tokenizer: Tokenizer | EagleTokenizer
 ) -> None:
-    """Raises ValueError if POUNCE cannot read an instruction, beside a state in the middle of its range."""
+    """Raises ValueError if POUNCE cannot read an instruction, even beside a state of the fewest digits."""
     if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
-        pi05_prompt(instruction, np.zeros(config.robot_state_dim, dtype=np.float32), config, tokenizer)
+        pi05_prompt(instruction, np.full(config.robot_state_dim, -1.0, dtype=np.float32), config, tokenizer)
     elif isinstance(config, GrootPounceConfig) and isinstance(tokenizer, EagleTokenizer):
         groot_prompt_ids(instruction, config, tokenizer)
 
