@@ -118,6 +118,18 @@ def test_image_tokens_must_match_the_patches(engine: EagerEngine, request_: Requ
         )
 
 
+def test_a_frame_of_every_camera_is_needed(request_: Request) -> None:
+    bundle = random_bundle(tiny_groot(num_carriers=2, cognition_size=24), seed=0)
+    with pytest.raises(ValueError, match="a frame of each of 2 cameras, came 1; the model was saved with other"):
+        groot_inputs(
+            replace(request_, frames=request_.frames[:1]),
+            bundle.model.config,  # type: ignore[arg-type]
+            bundle.tokenizer,  # type: ignore[arg-type]
+            bundle.statistics,
+            torch.device("cpu"),
+        )
+
+
 def test_bfloat16_rows_stay_near_float32(engine: EagerEngine, request_: Request) -> None:
     half = EagerEngine(random_bundle(tiny_groot(num_carriers=2, cognition_size=24), seed=0), dtype="bfloat16")
     error = np.abs(half.invoke(request_) - engine.invoke(request_))

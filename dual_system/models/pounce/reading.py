@@ -96,7 +96,10 @@ def groot_inputs(
     """
     images, _ = _views(moment.frames, config.image_px, device)
     if images.shape[1] != config.num_cameras:
-        raise ValueError(f"expected a frame of each of {config.num_cameras} cameras, came {images.shape[1]}")
+        raise ValueError(
+            f"expected a frame of each of {config.num_cameras} cameras, came {images.shape[1]}; the model was saved "
+            "with other cameras"
+        )
     token_ids = groot_prompt_ids(_instruction(moment, config.reads_subgoal), config, tokenizer)
     state = torch.zeros(1, config.groot.state_dim)
     state[0, : config.robot_state_dim] = torch.from_numpy(statistics.normalise_states(moment.proprio))
