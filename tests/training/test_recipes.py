@@ -158,6 +158,11 @@ def test_text_without_a_loss_or_a_loss_without_text_is_refused() -> None:
         replace(recipe("robocasa_dc"), w2=0.1)
 
 
+def test_numbers_of_any_robot_are_not_scaled_by_row() -> None:
+    with pytest.raises(ValueError, match="statistics_by_row scales offsets from the state"):
+        replace(recipe("robocasa_dc"), statistics_by_row=True)
+
+
 def test_a_pounce_that_learns_alone_may_have_texts_in_rows_and_no_loss_on_them() -> None:
     assert replace(recipe("robomme"), trains="pounce", w2=0.0).example.is_grounded
 
