@@ -82,8 +82,8 @@ class Recipe:
             raise ValueError(f"recipe {self.name}: one of grounds_memory and grounds_pointer: both have weight w2")
         if self.statistics_by_row and self.space == "native":
             raise ValueError(
-                f"recipe {self.name}: statistics_by_row scales offsets from the state, and a native chunk has the data's "
-                "numbers; expected statistics_by_row=False or another space"
+                f"recipe {self.name}: statistics_by_row scales offsets from the state, and a native chunk has the "
+                "data's numbers; expected statistics_by_row=False or another space"
             )
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")

@@ -22,7 +22,7 @@ from dual_system.analysis.markdown import markdown
 from dual_system.models.ponder.checkpoint import load_ponder
 from dual_system.models.ponder.context import Row
 from dual_system.models.ponder.coordinates import XY_1000
-from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from dual_system.training.collate import collate_ponder
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.diagnose import EVERY_INVOCATION, in_turns
@@ -34,7 +34,11 @@ from protocol.command_line import command, parse
 
 ABOUT = """\
 Teacher-forced, once a second. *Told apart*: whether something new is to be said. *Right*: each token of a text is the
-most likely one; *but for places*: each that is no place. *Off*: distance of a place, in % of the picture's side."""
+most likely one; *but for places*: each that is no place. *Places*: those that no earlier text of the episode has, since
+one that was read can be copied. *Off*: a place's distance from the right one, in % of the picture's side."""
+
+_NEAR = 40
+"""What is no further off is the same thing, in thousandths of the picture's side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +69,25 @@ class Found:
     is_right: list[bool] = field(default_factory=list)
     is_right_but_places: list[bool] = field(default_factory=list)
     off: list[float] = field(default_factory=list)
-    """Distance of every place, in thousandths of the picture's side."""
+    """Distance of every place that is new to its row, in thousandths of the picture's side."""
+
+    def add(self, row: Row, logits_NV: torch.Tensor, vocabulary: Vocabulary) -> None:
+        """Adds an episode: its row, and logits at the row's `supervised_index`."""
+        targets_N = torch.from_numpy(np.asarray(row.targets)[row.supervised_index + 1])
+        self.loss += F.cross_entropy(logits_NV.float(), targets_N, reduction="none").tolist()
+        predicted = logits_NV.argmax(dim=-1).tolist()
+        read: set[tuple[str, str]] = set()
+        for begin, end in supervised_spans(row):
+            wanted, said = targets_N[begin:end].tolist(), predicted[begin:end]
+            self.is_told_apart.append(wanted[0] == said[0])
+            if len(wanted) > 1:
+                self.is_right.append(wanted == said)
+                wanted_text, said_text = vocabulary.decode(wanted), vocabulary.decode(said)
+                self.is_right_but_places.append(XY_1000.sub("", wanted_text) == XY_1000.sub("", said_text))
+                for pair in zip(XY_1000.findall(wanted_text), XY_1000.findall(said_text), strict=False):
+                    if pair[0] not in read:
+                        read.add(pair[0])
+                        self.off.append(float(np.hypot(*np.subtract(*np.array(pair, int)))))
 
 
 @command("pp-diagnose words")
@@ -77,7 +99,8 @@ def main(argv: list[str] | None = None, prog: str = "pp-diagnose words") -> int:
         for task, found in measure(folder, options).items()
     ]
     head = ["PONDER of", "task", "nats a token", "told apart, %", "texts", "right, %", "right but for places, %"]
-    table = f"{ABOUT}\n\n{markdown([*head, 'places', 'off, %: median, p90'], rows)}\n"
+    head += ["places", "off, %: median, p90", f"at most {_NEAR / 10:.0f} % off, %"]
+    table = f"{ABOUT}\n\n{markdown(head, rows)}\n"
     if options.out is not None:
         with files.writing(options.out):
             files.folder(options.out)
@@ -105,23 +128,9 @@ def measure(folder: Path, options: WordsOptions) -> dict[str, Found]:
         episode = collate_ponder([example])
         for row, hidden_TH in zip(episode.rows, encode_rows(ponder, episode), strict=True):
             if len(places := row.supervised_index):
-                _add(found.setdefault(data.names[number][0], Found()), row, ponder.logits(hidden_TH[places]), ponder)
+                of_task = found.setdefault(data.names[number][0], Found())
+                of_task.add(row, ponder.logits(hidden_TH[places]), ponder.format.vocabulary)
     return dict(sorted(found.items()))
-
-
-def _add(found: Found, row: Row, logits_NV: torch.Tensor, ponder: Ponder) -> None:
-    targets_N = torch.from_numpy(np.asarray(row.targets)[row.supervised_index + 1])
-    found.loss += F.cross_entropy(logits_NV.float(), targets_N, reduction="none").tolist()
-    predicted, decode = logits_NV.argmax(dim=-1).tolist(), ponder.format.vocabulary.decode
-    for begin, end in supervised_spans(row):
-        wanted, said = targets_N[begin:end].tolist(), predicted[begin:end]
-        found.is_told_apart.append(wanted[0] == said[0])
-        if len(wanted) > 1:
-            found.is_right.append(wanted == said)
-            wanted_text, said_text = decode(wanted), decode(said)
-            found.is_right_but_places.append(XY_1000.sub("", wanted_text) == XY_1000.sub("", said_text))
-            pairs = list(zip(XY_1000.findall(wanted_text), XY_1000.findall(said_text), strict=False))
-            found.off += [float(np.hypot(*np.subtract(*np.array(pair, int)))) for pair in pairs]
 
 
 def _cells(found: Found) -> Sequence[str]:
@@ -130,7 +139,8 @@ def _cells(found: Found) -> Sequence[str]:
 
     off = " ".join(f"{each / 10:.1f}" for each in np.quantile(found.off, (0.5, 0.9))) if found.off else ""
     told = [f"{np.mean(found.loss):.3f}", share(found.is_told_apart), f"{len(found.is_right)}", share(found.is_right)]
-    return [*told, share(found.is_right_but_places), f"{len(found.off)}", off]
+    near = share([each <= _NEAR for each in found.off])
+    return [*told, share(found.is_right_but_places), f"{len(found.off)}", off, near]
 
 
 if __name__ == "__main__":
