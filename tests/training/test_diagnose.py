@@ -23,7 +23,7 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.training import diagnose, words
-from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.collate import collate_pounce
 from dual_system.training.diagnose import (
     EVERY_INVOCATION,
     STALE_BY,
@@ -188,29 +188,6 @@ def test_one_command_measures_and_another_draws(tmp_path: Path, capsys: pytest.C
 
 
 # -- PONDER's words
-
-
-@pytest.mark.parametrize(
-    ("said", "is_right", "is_right_but_places", "off"),
-    [
-        ("pick it at [200, 300]", True, True, 0.0),
-        ("pick it at [230, 340]", False, True, 50.0),
-        ("pick to at [200, 300]", False, False, 0.0),
-    ],
-)
-def test_a_text_is_compared_in_its_words_and_in_its_places(
-    said: str, is_right: bool, is_right_but_places: bool, off: float
-) -> None:
-    row, other = (collate_ponder([example(text)]).rows[0] for text in ("pick it at [200, 300]", said))
-    predicted = torch.from_numpy(np.asarray(other.targets)[other.supervised_index + 1])
-    logits = 50 * torch.nn.functional.one_hot(predicted, PONDER.vocab_size).float()
-    found = words.Found()
-    words._add(found, row, logits, PONDER)
-    assert found.is_told_apart == [True] * 8  # queries, once a second
-    assert found.is_right == [is_right] * len(CHANGES)
-    assert found.is_right_but_places == [is_right_but_places] * len(CHANGES)
-    assert found.off == [off] * len(CHANGES)
-    assert (max(found.loss) < 1e-6) == is_right
 
 
 def test_the_words_of_a_ponder_are_measured_without_a_pounce(

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from dual_system.data.episode import Package
-from dual_system.models.ponder.checkpoint import save_ponder
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.context import ContextFormat, Row, Transition
 from dual_system.models.ponder.network import Ponder
@@ -43,6 +39,7 @@ def test_what_was_recorded_is_right(form: ContextFormat) -> None:
     row = _row(form, "pick [120, 340]", "put it down")
     found = _found(form, row, row)
     assert max(found.loss) == 0
+    assert found.is_told_apart == [True] * 2
     assert (found.is_right, found.is_right_but_places, found.off) == ([True] * 2, [True] * 2, [0.0])
 
 
@@ -58,21 +55,3 @@ def test_a_place_that_was_read_before_is_not_asked_for_again(form: ContextFormat
 def test_another_word_is_wrong_wherever_its_place_is(form: ContextFormat) -> None:
     found = _found(form, _row(form, "pick red [120, 340]"), _row(form, "pick bed [120, 340]"))
     assert (found.is_right, found.is_right_but_places, found.off) == ([False], [False], [0.0])
-
-
-def test_the_command_prints_a_line_for_every_task_of_every_ponder(
-    tmp_path: Path,
-    package_of_noise: Callable[..., Package],
-    write_dataset: Callable[[Path, Iterable[Package]], Path],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    root = write_dataset(tmp_path / "set", [package_of_noise(seed, 21, num_rows=65) for seed in range(2)])
-    ponder = Ponder.random(replace(SMALL, image_px=(64, 64)), seed=1)
-    save_ponder(ponder, tmp_path / "own" / "ponder")
-    asked = ["--data", str(root), "--ponder", str(tmp_path / "own" / "ponder"), "--no-progress", "--out", str(tmp_path)]
-    assert words.main(asked) == 0
-    printed = capsys.readouterr().out
-    (line,) = [line for line in printed.splitlines() if line.startswith("| own | PickHighlight | ")]
-    cells = [cell.strip() for cell in line.strip("| ").split("|")]
-    assert cells[4] == "4"  # texts: two of each episode
-    assert (tmp_path / "words.md").read_text() == printed
