@@ -34,11 +34,11 @@ from protocol.command_line import command, parse
 
 ABOUT = """\
 Teacher-forced, once a second. *Told apart*: whether something new is to be said. *Right*: each token of a text is the
-most likely one; *but for places*: each that is no place. *Places*: those that no earlier text of the episode has, since
-one that was read can be copied. *Off*: a place's distance from the right one, in % of the picture's side."""
+most likely one; *but for places*: each that is no place. *Places*: each that the episode's texts have not had before,
+since one that was read can be copied. *Off*: a place's distance from the right one, in % of the picture's side."""
 
 _NEAR = 40
-"""What is no further off is the same thing, in thousandths of the picture's side."""
+"""Distance up to which a place counts as found, in thousandths of the picture's side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -48,6 +48,7 @@ def test_a_place_that_was_read_before_is_not_asked_for_again(form: ContextFormat
     said = _row(form, "seen at [150, 380]; pick [120, 340]", "pick [120, 340]", "pick [560, 349]")
     found = _found(form, row, said)
     assert found.off == [50.0, 9.0]
+    assert words._cells(found)[-1] == "50.0"  # 9 thousandths count as found, 50 do not
     assert found.is_right == [False, True, False]
     assert found.is_right_but_places == [True] * 3
 
