@@ -1,9 +1,9 @@
 """Stages of long work, run in slices of some minutes; a killed or ended slice is resumed.
 
-A stage is a set of commands that run side by side, one a core, each of which resumes by itself. One that has ended well
-is marked as done, and so is a stage without another. Stages are run in their order until the slice is over: by its
-minutes, SIGTERM or Ctrl-C. What each has cost, and each of its commands, is added to ``hours.jsonl``, of which
-`account` makes a table.
+A stage is a set of commands that run side by side, one a core, each of which resumes by itself; one that is alone has
+all cores. One that has ended well is marked as done, and so is a stage without another. Stages are run in their order
+until the slice is over: by its minutes, SIGTERM or Ctrl-C. What each has cost, and each of its commands, is added to
+``hours.jsonl``, of which `account` makes a table.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ def _run(stage: Stage, folder: Path, is_over: Callable[[], bool]) -> int:
     began_s = time.monotonic()
     _mark(stage, folder).parent.mkdir(exist_ok=True)
     left = [number for number in range(len(stage.commands)) if not _mark(stage, folder, number).exists()]
+    threads = max(1, (os.cpu_count() or 1) // max(1, len(left)))
     processes: list[subprocess.Popen[bytes]] = []
     core_s: dict[int, float] = {}
 
@@ -73,7 +74,7 @@ def _run(stage: Stage, folder: Path, is_over: Callable[[], bool]) -> int:
         if is_over():
             return UNFINISHED
         command = [sys.executable, "-m", *stage.commands[number]]
-        processes.append(process := subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}))
+        processes.append(process := subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": f"{threads}"}))
         code, core_s[number] = _ended(process, is_over)
         if not code:
             _mark(stage, folder, number).touch()

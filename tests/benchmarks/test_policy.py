@@ -216,6 +216,24 @@ def test_no_more_commands_run_at_once_than_there_are_cores(programs: Path, monke
     assert most == 1
 
 
+@pytest.mark.parametrize(("cores", "num_commands", "threads"), [(2, 1, "2"), (2, 2, "1"), (8, 3, "2"), (2, 5, "1")])
+def test_commands_share_the_cores(
+    programs: Path, monkeypatch: pytest.MonkeyPatch, cores: int, num_commands: int, threads: str
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    given, opened = [], subprocess.Popen
+
+    def noting(*arguments: Any, env: dict[str, str], **options: Any) -> Any:
+        given.append(env["OMP_NUM_THREADS"])
+        return opened(*arguments, env=env, **options)
+
+    monkeypatch.setattr(subprocess, "Popen", noting)
+    commands = tuple(("counting", f"{programs / f'{number}.txt'}", "1") for number in range(num_commands))
+    monkeypatch.setattr(policy, "stages", lambda *_: (Stage(name="some", commands=commands),))
+    assert policy.main(["--folder", str(programs)]) == DONE
+    assert given == [threads] * num_commands
+
+
 def test_a_command_that_fails_ends_the_slice(
     programs: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
