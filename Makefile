@@ -9,6 +9,8 @@ PB := protocol/ponderpounce/v1
 JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
 export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
+# Where it is set, every process that a test starts compiles our modules again (half a second each).
+unexport PYTHONDONTWRITEBYTECODE
 
 # `make help` lists the rest.
 .PHONY: help setup demo test unit oldest peers wheels accept soak images policy kitchen site lint types proto bench clean
@@ -61,7 +63,7 @@ demo: setup
 # Files share the cores; a test that keeps real time has them all.
 test: setup
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not peers and not realtime" --durations=10
-	$(BIN)/python -m pytest -q -m "realtime and not gpu and not acceptance and not peers" --durations=10
+	$(BIN)/python -m pytest -q $$(grep -rl --include='*.py' 'mark\.realtime' tests) -m "realtime and not gpu and not acceptance and not peers" --durations=10
 unit: setup
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not peers and not e2e and not slow"
 
