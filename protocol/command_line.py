@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import getpass
 import io
+import math
 import os
 import pwd
 import signal
@@ -32,6 +33,7 @@ Main = Callable[..., int]
 
 _GONE = frozenset({"--link.no-shared-memory"})
 """Options that scripts may still name, and that ask for what is done anyway."""
+_UNITS = ("_s", "_ms", "_hz", "_px", "_mb", "_ticks")
 REFUSED, INTERRUPTED, READER_LEFT = 2, 130, 141  # the latter two as a shell counts SIGINT and SIGPIPE
 
 _M_ARENA_MAX, _NUM_ARENAS = -8, 2  # glibc's malloc.h
@@ -121,9 +123,28 @@ def _share_arenas() -> None:
 
 
 def parse(kind: type[Options], argv: Sequence[str] | None, *, prog: str) -> Options:
-    """Returns the options in ``argv`` (None: the process's). Exits the process after ``--help`` or an error."""
+    """Returns the options in ``argv`` (None: the process's). Exits the process after ``--help`` or an error.
+
+    Raises:
+        ValueError: a number is not finite; a quantity with a unit, or a seed, is negative.
+    """
     argv = [argument for argument in (sys.argv[1:] if argv is None else argv) if argument not in _GONE]
-    return tyro.cli(kind, args=argv, prog=prog, description=kind.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+    options = tyro.cli(kind, args=argv, prog=prog, description=kind.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+    _check_numbers(options)
+    return options
+
+
+def _check_numbers(options: Any) -> None:
+    for field in dataclasses.fields(options):
+        value, name = getattr(options, field.name), field.name
+        if dataclasses.is_dataclass(value):
+            _check_numbers(value)
+        elif isinstance(value, (int, float)):
+            option = f"--{name.replace('_', '-')}"
+            if not abs(value) < math.inf:
+                raise ValueError(f"{option}: expected a finite number, came {value}")
+            if value < 0 and (name == "seed" or name.endswith(_UNITS)):
+                raise ValueError(f"{option}: expected a number of at least 0, came {value}")
 
 
 def flat(options: Any) -> dict[str, Any]:

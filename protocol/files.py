@@ -28,6 +28,7 @@ MAX_TOKENIZER_BYTES = 100 << 20
 """Largest tokenizer that is parsed; Qwen3.5's and Gemma's have 12 and 34 MB."""
 
 _LFS_POINTER = b"version https://git-lfs"
+_MCAP = b"\x89MCAP0\r\n"
 
 
 @contextmanager
@@ -73,6 +74,20 @@ def folder(path: Path) -> Path:
         raise NotADirectoryError(f"{path} is a file; expected a folder, or a name for a new one") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"{path} cannot be written to: not permitted, or a read-only disk")
+    return path
+
+
+def destination(path: Path) -> Path:
+    """Makes the folder of a file that a command writes; returns the file's path.
+
+    Raises:
+        OSError: the folder cannot be made or written to, or a log has the file's place.
+    """
+    folder(path.parent)
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(_MCAP)) == _MCAP:
+                raise FileExistsError(f"{path} is a log: a record is never overwritten. Name another file")
     return path
 
 

@@ -174,7 +174,9 @@ class SimOptions:
         return policy_of(self.ponder) if self.policy == "servers" else self.policy
 
     def check(self) -> None:
-        """Raises TransportError for what cannot work together."""
+        """Raises TransportError for what cannot work together, and for no episode at all."""
+        if self.episodes < 1:
+            raise TransportError(f"--episodes: expected at least 1, came {self.episodes}")
         if self.ponder == "none" and self.policy == "oracle":
             raise TransportError("--policy oracle plays without servers: leave --ponder none out")
         if self.ponder == "none" and self.ponder_checkpoint is not None:

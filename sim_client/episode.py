@@ -73,6 +73,11 @@ class RobotSide:
     _subgoal_index: int = -1
     _stopped_ticks: int = 0
 
+    @property
+    def num_ticks(self) -> int:
+        """Number of ticks played so far."""
+        return self._tick
+
     def run(self, info: m.EpisodeInfo, first: Snapshot, on_tick: Callable[[int], None]) -> Outcome:
         """Plays until the task ends, or the servers do."""
         self.actions.drain()  # of the last episode

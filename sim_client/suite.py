@@ -116,16 +116,20 @@ class Suite:
         ceiling, chance = ceiling_in(task, environment.layout), first_choice_in(task, environment.layout)
         opened, unpaired = m.OpenReply(), ""
         self._recorder.begin(info, path)
-        if info.policy == "oracle":
-            outcome, _ = play_oracle(info, side, first, on_tick)
-        elif why_not or (unpaired := why_unpaired(environment)):
-            outcome = Outcome(status=m.TaskStatus.ABORTED, reason=why_not or unpaired, num_ticks=0)
-        else:
-            try:
+        try:
+            if info.policy == "oracle":
+                outcome, _ = play_oracle(info, side, first, on_tick)
+            elif why_not or (unpaired := why_unpaired(environment)):
+                outcome = Outcome(status=m.TaskStatus.ABORTED, reason=why_not or unpaired, num_ticks=0)
+            else:
                 opened = self._end.open(m.OpenRequest(info=info, demo=self._demonstration(environment, sampling)))
                 outcome = side.run(info, first, on_tick)
-            except (TransportError, EpisodeRefused) as error:
-                outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
+        except (TransportError, EpisodeRefused) as error:
+            outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
+        except BaseException as error:  # a person's Ctrl-C, or a defect: the log has what was played until then
+            reason = "interrupted" if isinstance(error, KeyboardInterrupt) else repr(error)
+            self._end.end(m.TaskStatus.ABORTED, reason, side.num_ticks, with_servers=info.policy != "oracle")
+            raise
         result, missing = self._end.end(
             outcome.status, outcome.reason, outcome.num_ticks, with_servers=info.policy != "oracle"
         )

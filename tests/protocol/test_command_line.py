@@ -5,15 +5,20 @@ from __future__ import annotations
 import ctypes
 import errno
 import getpass
+import math
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
+import tyro
+from hypothesis import given
+from hypothesis import strategies as st
 
-from protocol.command_line import command
+from protocol.command_line import command, parse
 from protocol.errors import CommandError, FileError
 
 
@@ -41,6 +46,39 @@ def that_raises(error: BaseException) -> Callable[..., int]:
 def test_what_a_person_can_mend_is_a_sentence(error: Exception, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert that_raises(error)([]) == 2
     assert capsys.readouterr().err == said
+
+
+@dataclass(frozen=True)
+class Timing:
+    patience_s: float = 1.0
+    """Longest wait."""
+
+
+@dataclass(frozen=True)
+class Options:
+    timing: tyro.conf.OmitArgPrefixes[Timing] = Timing()
+    offset: float = 0.0
+    """Any finite number."""
+    delay_ms: int = 300
+    """A quantity."""
+    seed: int = 0
+    """Of the scene."""
+
+
+@given(
+    st.tuples(st.sampled_from(["patience-s", "offset"]), st.floats())
+    | st.tuples(st.sampled_from(["delay-ms", "seed"]), st.integers(-(10**30), 10**30))
+)
+def test_a_number_that_is_none_or_cannot_be_is_refused_by_its_option_s_name(said: tuple[str, float]) -> None:
+    name, value = said
+    argv = [f"--{name}={value!r}"]
+    if math.isfinite(value) and (value >= 0 or name == "offset"):
+        options = parse(Options, argv, prog="pp-thing")
+        assert {"patience-s": options.timing.patience_s, "offset": options.offset, "delay-ms": options.delay_ms,
+                "seed": options.seed}[name] == value  # fmt: skip
+    else:
+        with pytest.raises(ValueError, match=f"--{name}: expected a( finite)? number"):
+            parse(Options, argv, prog="pp-thing")
 
 
 def test_a_verb_is_called_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:

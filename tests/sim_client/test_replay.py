@@ -179,6 +179,20 @@ def test_without_a_display_the_ways_out_are_named(
 
 
 @pytest.mark.parametrize("option", ["--save", "--screenshot"])
+@pytest.mark.parametrize("target", ["a.mcap", "link", "other.log"])
+def test_a_log_is_never_overwritten(
+    option: str, target: str, record: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = record(tmp_path / "a.mcap")
+    content = log.read_bytes()
+    (tmp_path / "link").symlink_to(log)
+    (tmp_path / "other.log").write_bytes(content)
+    assert replay.main([str(log), option, str(tmp_path / target)]) == 2
+    assert f"{target} is a log: a record is never overwritten" in capsys.readouterr().err
+    assert log.read_bytes() == (tmp_path / "other.log").read_bytes() == content
+
+
+@pytest.mark.parametrize("option", ["--save", "--screenshot"])
 def test_a_target_that_cannot_be_written_is_named_at_once(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -146,6 +146,38 @@ def test_an_episode_without_a_ponder_asks_for_no_demonstration(tmp_path: Path) -
     assert next(disagreements(record), None) is None
 
 
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("policy", "error"),
+    [("oracle", KeyboardInterrupt()), ("oracle", RuntimeError("no frame")), ("servers", KeyboardInterrupt())],
+)
+def test_an_episode_that_is_broken_off_has_a_whole_log(policy: Any, error: BaseException, tmp_path: Path) -> None:
+    options = SimOptions(
+        task="PickHighlight",
+        policy=policy,
+        in_process=policy == "servers",
+        ponder="none" if policy == "servers" else "serve",
+        out=tmp_path,
+    )
+
+    def break_off(episode: int, tick: int) -> None:
+        if tick == 5:
+            raise error
+
+    with Daemons(tmp_path) as daemons:
+        harness = open_harness(options, daemons)
+        with pytest.raises(type(error)):
+            Suite(options, harness.link, harness.clock, lambda: "").run(break_off)
+    (log,) = tmp_path.rglob("*.mcap*")
+    record = read_log(log)
+    assert not record.recovered
+    assert record.result is not None
+    assert (record.result.status, record.result.num_ticks) == (m.TaskStatus.ABORTED, 5)
+    assert record.result.reason in ("interrupted", "RuntimeError('no frame')")
+    assert [tick.tick for tick in record.ticks][:5] == [0, 1, 2, 3, 4]
+    assert next(disagreements(record), None) is None
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [({"policy": "oracle"}, "leave --ponder none out"), ({"ponder_checkpoint": Path("x")}, "--ponder-checkpoint out")],
