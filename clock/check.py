@@ -109,6 +109,8 @@ def _check(path: Path, config: CheckConfig, head: ResidualHead | None) -> int:
             recover(path, config.recover)
             path = config.recover
         record, gaps = before_gaps(read_log(path))
+        if gaps and not record.ticks:
+            raise FileError(f"nothing of it can be checked: {gaps}")
         with files.reading(path, "log of an episode"):  # an odd number may fail anywhere in the derivation
             found = next(disagreements(record, head), None)
             dropped = int(record.metadata.get("ponderpounce.result", {}).get("dropped_messages", "0"))

@@ -17,6 +17,13 @@ _FILES = {
     "dataset": ["meta/**", "data/**", "videos/**"],
 }
 """What a loader may read: no pickles, and no second copy of the weights in another format."""
+_ON_THE_HUB = re.compile(r"(https?:/+huggingface\.co/)?(?P<repo>[\w.-]+/[\w.-]+)")
+_UNREAD = {
+    "*.incomplete": "a download that has not ended",
+    "adapter_*.safetensors": "an adapter, to be merged into its base model first",
+    "*.bin": "weights in pickles, which are never read: convert them to safetensors",
+    "*.pt": "weights in pickles, which are never read: convert them to safetensors",
+}
 
 
 def local_folder(path: Path, kind: Literal["model", "dataset"] = "model") -> Path:
@@ -49,3 +56,18 @@ def local_folder(path: Path, kind: Literal["model", "dataset"] = "model") -> Pat
         told = " ".join(str(error).split())[:300]
         raise FileNotFoundError(f"{path}: the Hugging Face hub did not give it: {told}") from error
     return Path(found)
+
+
+def instead_of(folder: Path) -> str:
+    """What stands in the place of a checkpoint, as ": ..." after an error about what is missing; "" if nothing does."""
+    if folder.is_file():
+        return ": it is a file; name its folder"
+    if not folder.is_dir():
+        named = _ON_THE_HUB.fullmatch(str(folder))
+        return ": there is no such folder" + (f"; the hub's model is hf:{named['repo']}" if named else "")
+    if inner := sorted(folder.glob("*/config.json")):
+        return f"; {inner[0].parent} has a config.json"
+    for pattern, what in _UNREAD.items():
+        if found := sorted(folder.glob(pattern)):
+            return f"; {found[0].name} is {what}"
+    return ""

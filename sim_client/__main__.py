@@ -36,7 +36,10 @@ def main(argv: list[str] | None = None) -> int:
         with Daemons(files.folder(options.out)) as daemons:
             results, unwritten = _run(options, daemons)
     except KeyboardInterrupt:
-        print("sim-client: interrupted; logs are closed, and finished episodes, if any, are in results.json", file=sys.stderr)
+        print(
+            "sim-client: interrupted; logs are closed, and finished episodes, if any, are in results.json",
+            file=sys.stderr,
+        )
         return 130
     episodes = results["episodes"]
     for episode in episodes:

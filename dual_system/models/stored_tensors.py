@@ -14,6 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from dual_system.hub import instead_of
 from protocol.files import read_object, require_file
 
 Shape = tuple[int, ...]
@@ -125,7 +126,9 @@ def weights_files(path: Path) -> list[Path]:
     index = _index_of(path)
     if not index.exists():
         if not path.exists() and not path.is_symlink():
-            raise FileNotFoundError(f"checkpoint {path.parent} has no {path.name} and no {index.name}")
+            raise FileNotFoundError(
+                f"checkpoint {path.parent} has no {path.name} and no {index.name}{instead_of(path.parent)}"
+            )
         require_file(path)
         return [path]
     listed = _weight_map(index)

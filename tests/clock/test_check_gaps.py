@@ -84,3 +84,13 @@ def test_the_command_names_it(
     said = capsys.readouterr().out
     assert "6 of the ticks of clock never reached the recorder" in said
     assert "agrees (19 ticks" in said
+
+
+def test_a_log_of_which_nothing_can_be_checked_does_not_pass(
+    whole: EpisodeRecord, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    from clock import check
+
+    monkeypatch.setattr(check, "read_log", lambda path: replace(whole, chunks=[], cognitions=[]))
+    assert check.main([str(tmp_path / "cut.mcap")]) == 2
+    assert "nothing of it can be checked: checked up to " in capsys.readouterr().out

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,3 +74,30 @@ def test_without_the_client_the_way_out_is_said(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ValueError, match="pip install huggingface_hub"):
         local_folder(Path("hf:org/name"))
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("Qwen/Qwen3.5-0.8B", "there is no such folder; the hub's model is hf:Qwen/Qwen3.5-0.8B"),
+        ("https://huggingface.co/Qwen/Qwen3.5-0.8B", "the hub's model is hf:Qwen/Qwen3.5-0.8B"),
+        ("/no/such/folder", "there is no such folder"),
+        ("file", "it is a file; name its folder"),
+        ("outer", "outer/pretrained_model has a config.json"),
+        ("pickles", "pytorch_model.bin is weights in pickles, which are never read: convert them"),
+        ("adapter", "adapter_model.safetensors is an adapter, to be merged into its base model first"),
+        ("cut", "model.safetensors.incomplete is a download that has not ended"),
+    ],
+)
+@pytest.mark.parametrize("load", [load_ponder, load_bundle])
+def test_what_stands_in_the_place_of_a_checkpoint_is_said(
+    load: Callable[[Path], object], path: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    for name in ("outer/pretrained_model/config.json", "pickles/pytorch_model.bin", "adapter/adapter_model.safetensors",
+                 "cut/model.safetensors.incomplete"):  # fmt: skip
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text("{}")
+    with pytest.raises(FileNotFoundError, match=re.escape(said)):
+        load(Path(path))

@@ -313,6 +313,21 @@ def test_a_tokenizer_of_another_checkpoint_is_noticed(folder: Path) -> None:
         load_ponder(folder)
 
 
+@pytest.mark.parametrize("lacks", ["rope_theta", "mrope_section"])
+def test_a_rotation_is_never_guessed(folder: Path, lacks: str) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    text, whole = config["text_config"], config["text_config"].pop("rope_parameters")
+    text |= {"rope_theta": whole.pop("rope_theta"), "partial_rotary_factor": whole.pop("partial_rotary_factor")}
+    text["rope_scaling"] = whole
+    (folder / "config.json").write_text(json.dumps(config))
+    load_ponder(folder)  # as folders of transformers 4 spell it
+    text.pop(lacks, None)
+    whole.pop(lacks, None)
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match=f"text_config.rope_parameters lacks {lacks}"):
+        load_ponder(folder)
+
+
 def test_another_architecture_is_refused(folder: Path) -> None:
     (folder / "config.json").write_text(json.dumps({"model_type": "llama"}))
     with pytest.raises(CheckpointError, match="'llama'"):

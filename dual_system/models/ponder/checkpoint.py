@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from transformers.models.qwen3_5 import Qwen3_5Config
 
-from dual_system.hub import local_folder
+from dual_system.hub import instead_of, local_folder
 from dual_system.models.config_json import from_json
 from dual_system.models.ponder.context import ContextFormat, OpeningForm
 from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
@@ -83,7 +83,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
     directory = local_folder(directory)
     config_path = directory / CONFIG_NAME
     if not config_path.exists() and not config_path.is_symlink():
-        raise FileNotFoundError(f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json).")
+        raise FileNotFoundError(f"checkpoint {directory} has no {CONFIG_NAME}{instead_of(directory)}")
     raw = read_object(config_path)
     if raw.get("model_type") != "qwen3_5":
         raise CheckpointError(f"{config_path}: model_type is {raw.get('model_type')!r}; PONDER reads 'qwen3_5'.")
@@ -94,6 +94,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
     stored, reader = _read_stored(directory)
     with _describing_a_network(config_path):
         _require_dtypes(raw)
+        _require_rope(raw)
         qwen_config = Qwen3_5Config.from_dict(raw)
         shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(skeleton(qwen_config)).items()}
         if any(name.startswith(MTP_PREFIX) for name in tensors.shapes):
@@ -235,6 +236,14 @@ def _require_dtypes(values: dict[str, Any]) -> None:
             _require_dtypes(value)
         elif name in ("dtype", "torch_dtype") and value not in (None, "float32", "bfloat16", "float16", "float64"):
             raise ValueError(f"{name} is {value!r}, expected a floating dtype")
+
+
+def _require_rope(values: dict[str, Any]) -> None:
+    """Raises ValueError without the rotation's base and sections: transformers has a default, which no Qwen3.5 has."""
+    text = values.get("text_config") or {}
+    rope = text.get("rope_parameters") or {"rope_theta": text.get("rope_theta"), **(text.get("rope_scaling") or {})}
+    if missing := [name for name in ("rope_theta", "mrope_section") if not rope.get(name)]:
+        raise ValueError(f"text_config.rope_parameters lacks {' and '.join(missing)}")
 
 
 def _read_stored(directory: Path) -> tuple[StoredPonder, ObservationReader]:

@@ -282,7 +282,7 @@ def _read_config(path: Path) -> tuple[dict[str, Any] | None, AnyStoredConfig | N
     values = read_object(path)
     refuse_quantised(values, path)
     if values.get("format") == FORMAT:
-        return values, from_json(StoredConfig, values, path.name)
+        return values, from_json(StoredConfig, values, str(path))
     if values.get("format") == GROOT_FORMAT:
-        return values, from_json(StoredGrootConfig, values, path.name)
+        return values, from_json(StoredGrootConfig, values, str(path))
     return values, None
