@@ -7,6 +7,7 @@ import sys
 from dataclasses import dataclass, field
 
 from protocol.command_line import command, parse
+from protocol.errors import CallFailed, CommandError
 from protocol.link import Link
 from protocol.messages import EngageRequest
 from protocol.options import LinkOptions
@@ -33,6 +34,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         link = Link(bus, robot=options.link.robot, proc="engage")
         reply = link.call(ENGAGE, "clock", EngageRequest(operator=options.operator), timeout_ns=_CALL_NS)
+    except CallFailed as error:
+        raise CommandError(f"{error}. With --local, the log of pp-gateway has the whole command") from None
     finally:
         bus.close()
     sys.stdout.write(f"{reply.error or reply.level}\n")

@@ -1,7 +1,7 @@
 """Your own action model behind POUNCE's contract (`spec`, `invoke`, `warm_up`); here a few lines of NumPy.
 
 python examples/04_your_own_policy.py                                 # a short lockstep episode, in this process
-python examples/04_your_own_policy.py --serve tcp/127.0.0.1:7449      # in the place of pounce-serve, over zenoh
+python examples/04_your_own_policy.py --serve                         # in the place of pounce-serve, on its socket
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.options import LinkOptions
 from protocol.process import StopFlag, host_clock_id, run
+from protocol.sockets import endpoint
 from protocol.zenoh_bus import open_bus
 
 
@@ -69,10 +70,10 @@ def server_on(bus: Bus) -> PounceServer:
     return server
 
 
-def serve(endpoint: str) -> None:
+def serve(listen: str) -> None:
     """As ``pounce-serve`` does, until SIGTERM or Ctrl-C."""
     should_stop = StopFlag()
-    bus = open_bus(LinkOptions(listen=(endpoint,)))
+    bus = open_bus(LinkOptions(listen=(listen,)))
     try:
         run(bus, server_on(bus).step, should_stop)
     finally:
@@ -102,8 +103,8 @@ def episode(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--serve"] and len(sys.argv) == 3:
-        serve(sys.argv[2])
+    if sys.argv[1:2] == ["--serve"] and len(sys.argv) <= 3:
+        serve(sys.argv[2] if len(sys.argv) == 3 else endpoint("pounce"))
     elif len(sys.argv) == 1:
         with tempfile.TemporaryDirectory() as folder:
             episode(Path(folder))

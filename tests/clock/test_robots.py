@@ -35,7 +35,7 @@ def robot_of(name: str) -> m.Robot:
     return found.describe(middle.astype(np.float32), (48, 64))
 
 
-NAMES = ("six_axes", "two_arms", "arm_on_base", "panda_omron")
+NAMES = ("six_axes", "so101", "two_arms", "arm_on_base", "panda_omron")
 ROBOTS = {name: robot_of(name) for name in NAMES}
 BASE = ROBOTS["arm_on_base"]
 

@@ -10,6 +10,7 @@ import pytest
 from protocol.peers.mapping import read_mapping
 from protocol.peers.translation import request_of, rows_of
 from sim_client.gateway import groot, lerobot
+from sim_client.robot_file import read_robot
 
 FOLDER = Path(__file__).parents[2] / "examples" / "policies"
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -20,6 +21,16 @@ def test_an_so101_s_degrees_become_ours() -> None:
     mapping = read_mapping(FOLDER / "lerobot_so101.toml")
     rows = rows_of(mapping, {("action",): np.tile([180.0, 0, 0, 0, 0, 50.0], (50, 1))}, np.zeros(6, np.float32))
     assert rows[0] == pytest.approx([np.pi, 0, 0, 0, 0, 0.5])
+
+
+def test_an_so101_s_mapping_is_of_the_robot_that_its_file_describes() -> None:
+    mapping, robot = read_mapping(FOLDER / "lerobot_so101.toml"), read_robot(FOLDER.parent / "robots/so101.toml").robot
+    assert (mapping.num_proprio, mapping.num_commands) == (robot.num_proprio, robot.action_dim)
+    assert mapping.play_hz == robot.control_hz
+    assert tuple(camera.camera for camera in mapping.cameras) == robot.cameras
+    lerobot.check_mapping(mapping, robot.cameras)
+    names = [f"{dimension.name}.pos" for dimension in robot.dimensions]
+    assert names == [*mapping.names["action",]] == [*mapping.names["observation.state",]]
 
 
 @pytest.mark.parametrize("path", PANDAS, ids=[path.stem for path in PANDAS])

@@ -198,8 +198,10 @@ class _Drive:
         target = np.where(np.isfinite(self._step), target, sent)  # a gripper stays as it is
         period_ns = self._client.period_ns
         while np.abs(target - sent).max() > 1e-6:
-            if self._robot.observe().robot_state != "ok" or self._watchdog.has_fired:
-                self._say("parking ended: the robot was stopped")
+            seen = self._robot.observe()
+            if seen.robot_state != "ok" or self._watchdog.has_fired:
+                by = f"{seen.robot_state} {seen.robot_text}" if seen.robot_state != "ok" else "the watchdog stopped it"
+                self._say(f"not parked: {by}. It stays where it is")
                 return
             sent = (sent + np.clip(target - sent, -self._step, self._step)).astype(np.float32)
             expires_ns = time.monotonic_ns() + 3 * period_ns
