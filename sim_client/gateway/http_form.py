@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from protocol.errors import TransportError
 from sim_client.gateway.arrays import pack
 from sim_client.gateway.challenge import RESET_FINISHED
-from sim_client.gateway.exchange import Busy, Dialect, Door, Finish, Packet, Refused, Terms
+from sim_client.gateway.exchange import Busy, Dialect, Door, Failed, Finish, Packet, Terms, refusal
 from sim_client.gateway.memory import Memory
 from sim_client.gateway.openpi import metadata
 from sim_client.gateway.websocket import KEY_WANTED, is_allowed
@@ -23,6 +23,8 @@ from sim_client.gateway.websocket import KEY_WANTED, is_allowed
 log = logging.getLogger("pp-gateway")
 
 SESSION_HEADER = "X-Session-Id"
+_STATUS = {Busy: HTTPStatus.SERVICE_UNAVAILABLE, Failed: HTTPStatus.INTERNAL_SERVER_ERROR}
+"""Status of a refusal; every other one is a bad request."""
 _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 _SILENT_S = 60.0  # a body that stops arriving does not hold its thread
 
@@ -77,17 +79,19 @@ class _Handler(BaseHTTPRequestHandler):
             self._leave_body(HTTPStatus.NOT_FOUND, "expected /reset or /infer\n")
         elif (body := self._body()) is not None:
             try:
-                self._say(HTTPStatus.OK, self._done(body))
-            except Busy as error:
-                self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{error}\n")
-            except Refused as error:
-                log.warning("client=%s refused: %s", self._client, error)
-                self._say(HTTPStatus.BAD_REQUEST, f"{error}\n")
+                self._say(*self._answered(body))
             finally:
                 self.server.memory.give(self)
 
+    def _answered(self, body: bytes) -> tuple[HTTPStatus, Packet]:
+        try:
+            return HTTPStatus.OK, self._done(body)
+        except Exception as error:
+            refused = refusal(error, self._client)
+            return _STATUS.get(type(refused), HTTPStatus.BAD_REQUEST), f"{refused}\n"
+
     def _done(self, body: bytes) -> Packet:
-        """Raises Refused."""
+        """Raises whatever reading and playing raise."""
         door, dialect = self.server.door, self.server.new_dialect(self.server.terms)
         if self.path == "/reset":
             door.submit(self._client, Finish()).result()

@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 
 from protocol.errors import TransportError
 from protocol.messages import Mode
-from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Finish, Packet, Refused, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Finish, Packet, Refused, Terms, refusal
 from sim_client.gateway.memory import Memory, counted
 from sim_client.gateway.openpi import metadata
 
@@ -85,11 +85,10 @@ class WebsocketSide:
                 try:
                     asked = await asyncio.to_thread(dialect.read, packet)
                     future = self.door.submit(client, asked.request) if asked.request is not None else None
-                except Refused as error:
-                    log.warning("client=%s refused: %s", client, error)
-                    await connection.send(dialect.refuse(str(error)))
+                except Exception as error:
+                    await connection.send(dialect.refuse(str(refusal(error, client))))
                     continue
-                task = asyncio.create_task(self._reply(connection, dialect, asked, future))
+                task = asyncio.create_task(self._reply(connection, client, dialect, asked, future))
                 under_way.add(task)
                 task.add_done_callback(under_way.discard)
                 while len(under_way) >= self._most_under_way:
@@ -111,13 +110,18 @@ class WebsocketSide:
         return 1 if self.terms.mode == Mode.LOCKSTEP else LIVE_UNDER_WAY
 
     async def _reply(
-        self, connection: ServerConnection, dialect: Dialect, asked: ClientRequest, future: Future[Answer | None] | None
+        self,
+        connection: ServerConnection,
+        client: str,
+        dialect: Dialect,
+        asked: ClientRequest,
+        future: Future[Answer | None] | None,
     ) -> None:
         try:
             answer = await asyncio.wrap_future(future) if future is not None else None
             packet: Packet | None = asked.reply if answer is None else dialect.answer(asked, answer)
-        except Refused as error:
-            packet = dialect.refuse(str(error))
+        except Exception as error:
+            packet = dialect.refuse(str(refusal(error, client)))
         if packet is not None:
             try:
                 await connection.send(packet)
