@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import http
 import json
 import logging
@@ -18,6 +17,7 @@ from websockets.http11 import Request, Response
 
 from protocol.errors import TransportError
 from protocol.messages import Mode
+from sim_client.gateway import reading
 from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Finish, Packet, Refused, Terms, refusal
 from sim_client.gateway.memory import Memory, counted
 from sim_client.gateway.openpi import metadata
@@ -134,4 +134,4 @@ KEY_WANTED = "expected the header Authorization: Api-Key WORD, with the word in 
 
 def is_allowed(authorization: str | None, api_key: str) -> bool:
     """Whether a client is admitted."""
-    return not api_key or hmac.compare_digest((authorization or "").encode(), f"Api-Key {api_key}".encode())
+    return not api_key or reading.is_secret(authorization, f"Api-Key {api_key}")
