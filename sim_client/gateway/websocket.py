@@ -63,13 +63,19 @@ class WebsocketSide:
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers health checks and metadata requests in plain HTTP; None lets the websocket begin."""
-        if request.path in ("/healthz", "/health"):
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
-        if not is_allowed(request.headers.get("Authorization"), self.api_key):
-            return connection.respond(http.HTTPStatus.UNAUTHORIZED, KEY_WANTED)
-        if request.path == "/metadata":
-            return connection.respond(http.HTTPStatus.OK, json.dumps(metadata(self.terms)) + "\n")
-        return None
+        path = route(request.path)
+        if path in ("/healthz", "/health"):
+            status, text = http.HTTPStatus.OK, "OK\n"
+        elif not is_allowed(request.headers.get("Authorization"), self.api_key):
+            status, text = http.HTTPStatus.UNAUTHORIZED, KEY_WANTED
+        elif path == "/metadata":
+            status, text = http.HTTPStatus.OK, json.dumps(metadata(self.terms)) + "\n"
+        else:
+            return None
+        response = connection.respond(status, text)
+        if getattr(request, "method", "GET") == "HEAD":  # older websockets know GET alone
+            response.body = b""
+        return response
 
     async def _converse(self, connection: ServerConnection) -> None:
         host, port, *_ = connection.remote_address
@@ -127,6 +133,11 @@ class WebsocketSide:
                 await connection.send(packet)
             except ConnectionClosed:
                 return  # the conversation's own loop reports it
+
+
+def route(path: str) -> str:
+    """The path of a request without its query and without slashes at its end."""
+    return path.partition("?")[0].rstrip("/")
 
 
 KEY_WANTED = "expected the header Authorization: Api-Key WORD, with the word in --api-key-file\n"
