@@ -123,15 +123,17 @@ def _modality(content: Any) -> Any:
     if not isinstance(content, str):
         return content
     try:
-        return json.loads(content)
-    except (ValueError, RecursionError) as error:
+        found = json.loads(content)
+        msgpack.packb(found)  # JSON can spell half a character, and numbers that no message carries
+        return found
+    except (ValueError, OverflowError, RecursionError) as error:
         raise NotAMessage(f"a modality configuration that is no JSON: {error}") from None
 
 
 def _msgpack_numpy(is_array: Any, data: Any, dtype: Any, shape: Any) -> Any:
     kind = dtype.decode("ascii", "replace") if isinstance(dtype, bytes) else dtype
     array = _array(data, kind, shape if is_array else [])
-    return array if is_array else array.item()
+    return array.item() if isinstance(array, np.ndarray) and not is_array else array
 
 
 def _npy(data: Any) -> NDArray[Any]:

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from protocol.messages import Floats
 from sim_client.gateway import reading
 from sim_client.gateway.arrays import pack
@@ -36,9 +34,9 @@ class ChallengeDialect:
 
     def read(self, packet: Packet) -> ClientRequest:
         message = reading.message(packet)
-        if message.get("reset"):
+        if reading.truth(message.get("reset", False), "reset"):
             return ClientRequest(Finish(is_reset=True), reply=pack(RESET_FINISHED, "openpi"))
-        begins = bool(reading.field(message, "is_first_step", "whether an episode begins"))
+        begins = reading.truth(reading.field(message, "is_first_step", "whether an episode begins"), "is_first_step")
         lists = {name: _list(message, key) for name, key in self._terms.cameras.items()}
         seen = reading.videos(lists)
         if len(seen) == 0:
@@ -83,13 +81,12 @@ def _states(message: Mapping[Any, Any], count: int, num_proprio: int) -> list[Fl
         raise Refused(f"{JOINTS_KEY}, {GRIPPER_KEY}: expected {count}, came {len(joints)} and {len(fingers)}")
     name = f"{JOINTS_KEY} and one finger"
     return [
-        reading.numbers(np.append(np.ravel(joint), [*np.ravel(finger)[:1], 0.0][0]), name, num_proprio)
+        reading.numbers(
+            [*reading.vector(joint, JOINTS_KEY), *[*reading.vector(finger, GRIPPER_KEY), 0.0][:1]], name, num_proprio
+        )
         for joint, finger in zip(joints, fingers, strict=True)
     ]
 
 
 def _list(message: Mapping[Any, Any], key: str) -> Sequence[Any]:
-    values = reading.field(message, key, "all that was seen since the last call")
-    if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str | bytes):
-        raise Refused(f"{key}: expected a list, came {type(values).__name__}")
-    return values  # type: ignore[return-value]  # an array of stacked frames serves as well
+    return reading.listed(reading.field(message, key, "all that was seen since the last call"), key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from clock.timebase import NS_PER_S
 from protocol.messages import Floats, Level, Mode, Robot, RobotState, TaskStatus
 from protocol.peers.mapping import PolicyMapping
+
+log = logging.getLogger("pp-gateway")
 
 Frames = Mapping[str, NDArray[np.uint8]]
 """Camera name -> (height, width, 3) RGB."""
@@ -26,6 +29,22 @@ class Refused(Exception):
 
 class Busy(Refused):
     """Another client has the robot."""
+
+
+class Failed(Refused):
+    """The gateway could not handle a request: a defect of ours."""
+
+
+def refusal(error: Exception, client: str) -> Refused:
+    """The refusal that a client gets for ``error``, whatever a request has raised; logged, with a defect's traceback.
+
+    Every side passes errors through here, so that no message ends a network thread or a connection.
+    """
+    if isinstance(error, Refused):
+        log.warning("client=%s refused: %s", client, error)
+        return error
+    log.error("client=%s: a request failed", client, exc_info=error)
+    return Failed(f"the gateway failed: {type(error).__name__}: {error}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -38,9 +38,10 @@ class GrootDialect:
     def read(self, packet: Packet) -> ClientRequest:
         self._spelling = _spelling_of(packet)
         message = reading.message(packet)
-        if self._token and message.get("api_token") != self._token:
+        if self._token and not reading.is_secret(message.get("api_token"), self._token):
             raise Refused("Unauthorized: expected the api_token that is in --api-key-file")
-        endpoint, data = message.get("endpoint", "get_action"), message.get("data")
+        endpoint = reading.word(message.get("endpoint", "get_action"), "endpoint", f"one of {_ENDPOINTS}")
+        data = message.get("data")
         if endpoint == "ping":
             return ClientRequest(None, reply=self._packed({"status": "ok", "message": "Server is running"}))
         if endpoint == "get_modality_config":
@@ -52,7 +53,7 @@ class GrootDialect:
             return ClientRequest(self._step(data if self.is_flat else self._within(data, "observation")))
         if endpoint == "kill":
             raise Refused("kill: a client does not end this server; stop pp-gateway where it was started")
-        raise Refused(f"endpoint {str(endpoint)[:80]!r}: expected one of {_ENDPOINTS}")
+        raise Refused(f"endpoint: expected one of {_ENDPOINTS}, came {reading.shown(endpoint)}")
 
     def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
         num_commands = answer.rows_NA.shape[1]
@@ -128,11 +129,11 @@ class GrootDialect:
 
     def _current(self, array: Any, name: str, num_dims: int) -> Any:
         """The only observation of the only robot: what is behind the batch's and time's axes, each of length 1."""
-        shape = getattr(array, "shape", ())
+        shape = array.shape if isinstance(array, np.ndarray) else ()
         axes = shape[: len(shape) - num_dims]
         expected = "(T, ...)" if self.is_flat else "(B, T, ...)"
         if len(axes) != (1 if self.is_flat else 2):
-            raise Refused(f"{name}: expected {expected}, came {shape or type(array).__name__}")
+            raise Refused(f"{name}: expected {expected}, came {reading.shown(array)}")
         if not self.is_flat and axes[0] != 1:
             raise Refused(f"{name}: {axes[0]} robots in one request; this server drives one at a time (B = 1)")
         if axes[-1] != 1:

@@ -15,14 +15,16 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from protocol.errors import TransportError
 from sim_client.gateway.arrays import pack
 from sim_client.gateway.challenge import RESET_FINISHED
-from sim_client.gateway.exchange import Busy, Dialect, Door, Finish, Packet, Refused, Terms
+from sim_client.gateway.exchange import Busy, Dialect, Door, Failed, Finish, Packet, Terms, refusal
 from sim_client.gateway.memory import Memory
 from sim_client.gateway.openpi import metadata
-from sim_client.gateway.websocket import KEY_WANTED, is_allowed
+from sim_client.gateway.websocket import KEY_WANTED, is_allowed, route
 
 log = logging.getLogger("pp-gateway")
 
 SESSION_HEADER = "X-Session-Id"
+_STATUS = {Busy: HTTPStatus.SERVICE_UNAVAILABLE, Failed: HTTPStatus.INTERNAL_SERVER_ERROR}
+"""Status of a refusal; every other one is a bad request."""
 _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 _SILENT_S = 60.0  # a body that stops arriving does not hold its thread
 
@@ -61,35 +63,39 @@ class _Handler(BaseHTTPRequestHandler):
     server: HttpSide
 
     def do_GET(self) -> None:
-        if self.path == "/healthz":
+        if self._route == "/healthz":
             self._say(HTTPStatus.OK, "OK\n")
         elif not self._is_allowed():
             self._say(HTTPStatus.UNAUTHORIZED, KEY_WANTED)
-        elif self.path == "/metadata":
+        elif self._route == "/metadata":
             self._say(HTTPStatus.OK, pack(metadata(self.server.terms), "openpi"))
         else:
             self._say(HTTPStatus.NOT_FOUND, "expected /healthz or /metadata\n")
 
+    do_HEAD = do_GET
+
     def do_POST(self) -> None:
         if not self._is_allowed():
             self._leave_body(HTTPStatus.UNAUTHORIZED, KEY_WANTED)
-        elif self.path not in ("/reset", "/infer"):
+        elif self._route not in ("/reset", "/infer"):
             self._leave_body(HTTPStatus.NOT_FOUND, "expected /reset or /infer\n")
         elif (body := self._body()) is not None:
             try:
-                self._say(HTTPStatus.OK, self._done(body))
-            except Busy as error:
-                self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{error}\n")
-            except Refused as error:
-                log.warning("client=%s refused: %s", self._client, error)
-                self._say(HTTPStatus.BAD_REQUEST, f"{error}\n")
+                self._say(*self._answered(body))
             finally:
                 self.server.memory.give(self)
 
+    def _answered(self, body: bytes) -> tuple[HTTPStatus, Packet]:
+        try:
+            return HTTPStatus.OK, self._done(body)
+        except Exception as error:
+            refused = refusal(error, self._client)
+            return _STATUS.get(type(refused), HTTPStatus.BAD_REQUEST), f"{refused}\n"
+
     def _done(self, body: bytes) -> Packet:
-        """Raises Refused."""
+        """Raises whatever reading and playing raise."""
         door, dialect = self.server.door, self.server.new_dialect(self.server.terms)
-        if self.path == "/reset":
+        if self._route == "/reset":
             door.submit(self._client, Finish()).result()
             return pack(RESET_FINISHED, "openpi")
         asked = dialect.read(body)
@@ -132,7 +138,12 @@ class _Handler(BaseHTTPRequestHandler):
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
-        self.wfile.write(body)
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    @property
+    def _route(self) -> str:
+        return route(self.path)
 
     @property
     def _client(self) -> str:

@@ -26,7 +26,7 @@ from protocol.peers.lerobot import (
 )
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus, is_loopback
-from sim_client.gateway.exchange import Answer, Busy, Finish, Refused, Terms
+from sim_client.gateway.exchange import Answer, Busy, Finish, Refused, Terms, refusal
 from sim_client.gateway.lerobot import Deployment, Session
 from sim_client.gateway.seats import Seats
 
@@ -112,17 +112,15 @@ class LerobotSide:
         try:
             asked = unpack(request.payload)
             self._take(asked, request.reply)
-        except (WireError, Refused) as error:
-            self._refuse(asked or getattr(error, "asked", None) or Envelope(kind="error"), error, request.reply)
         except Exception as error:
-            log.exception("LeRobot: a message failed")
-            told = WireError(Code.EXECUTION, f"the gateway failed: {type(error).__name__}: {error}")
-            self._refuse(asked or Envelope(kind="error"), told, request.reply)
+            self._refuse(asked or getattr(error, "asked", None) or Envelope(kind="error"), error, request.reply)
 
-    def _refuse(self, asked: Envelope, error: WireError | Refused, reply: Callable[[bytes], None]) -> None:
-        if isinstance(error, Refused):
-            error = WireError(Code.BUSY if isinstance(error, Busy) else Code.EXECUTION, str(error))
-        log.warning("LeRobot session=%s %s %s: %s", asked.session_id or "-", asked.kind, error.code, error)
+    def _refuse(self, asked: Envelope, error: Exception, reply: Callable[[bytes], None]) -> None:
+        if isinstance(error, WireError):
+            log.warning("LeRobot session=%s %s %s: %s", asked.session_id or "-", asked.kind, error.code, error)
+        else:
+            refused = refusal(error, f"LeRobot's session {asked.session_id[:8] or '-'}, {asked.kind}")
+            error = WireError(Code.BUSY if isinstance(refused, Busy) else Code.EXECUTION, str(refused))
         reply(pack(asked.error(error)))
 
     def _take(self, asked: Envelope, reply: Callable[[bytes], None]) -> None:
@@ -171,7 +169,7 @@ class LerobotSide:
                 answer = each.future.result()
                 told = each.done if answer is None else each.session.answered(each.asked, answer)
                 each.reply(pack(told if told is not None else each.asked))
-            except (WireError, Refused) as error:
+            except Exception as error:
                 self._refuse(each.asked, error, each.reply)
 
     def _look_after_absent(self) -> None:

@@ -7,7 +7,7 @@ come with ``infer`` alone, so the ticks between two requests have the wrist's la
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -35,10 +35,10 @@ class MmeVlaDialect:
 
     def read(self, packet: Packet) -> ClientRequest:
         message = reading.message(packet)
-        if message.get("reset"):
+        if reading.truth(message.get("reset", False), "reset"):
             self._buffer, self._demo, self._last = [], [], None
             return ClientRequest(Finish(is_reset=True), reply=pack({"reset_finished": True}, "openpi"))
-        if message.get("add_buffer"):
+        if reading.truth(message.get("add_buffer", False), "add_buffer"):
             self._fill(message)
             return ClientRequest(None, reply=pack({"add_buffer_finished": True}, "openpi"))
         return ClientRequest(self._step(message))
@@ -51,22 +51,22 @@ class MmeVlaDialect:
 
     def _fill(self, message: Mapping[Any, Any]) -> None:
         """Keeps what was seen. The last observation comes again with ``infer``."""
-        images, states = (
-            reading.field(message, key, "what was seen since the last call") for key in ("images", "state")
-        )
-        shape: tuple[int, ...] = getattr(images, "shape", ())
-        num_states = len(states) if isinstance(states, Sequence | np.ndarray) else 0
-        if len(shape) != 5 or shape[0] == 0 or shape[1] != 1 or num_states != shape[0]:
+        why = "what was seen since the last call"
+        images = reading.field(message, "images", why)
+        states = reading.listed(reading.field(message, "state", why), "state")
+        shape: tuple[int, ...] = images.shape if isinstance(images, np.ndarray) else ()
+        if len(shape) != 5 or shape[0] == 0 or shape[1] != 1 or len(states) != shape[0]:
             raise Refused(
                 f"images, state: expected (T, 1, height, width, 3) and T states of {self._terms.num_proprio} numbers, "
-                f"came {shape} and {num_states}"
+                f"came {shape or reading.shown(images)} and {len(states)}"
             )
         front = next(iter(self._terms.cameras))
         seen = [{front: reading.picture(frame, "images")} for frame in images[:, 0]]
         if self._last is None:
             start = message.get("exec_start_idx", 0)
             if not isinstance(start, int | np.integer) or not 0 <= start < len(seen):
-                raise Refused(f"exec_start_idx: expected 0 to {len(seen) - 1}, the last observation, came {start!r}")
+                expected = f"0 to {len(seen) - 1}, the last observation"
+                raise Refused(f"exec_start_idx: expected {expected}, came {reading.shown(start)}")
             self._demo, self._buffer = list(seen[:start]), []
             return
         if len(seen) != self._terms.rows:

@@ -39,7 +39,7 @@ class OpenpiDialect:
 
     def read(self, packet: Packet) -> ClientRequest:
         message = reading.message(packet)
-        if message.get("reset"):
+        if reading.truth(message.get("reset", False), "reset"):
             self._instruction = None
             return ClientRequest(Finish(is_reset=True), reply=pack({"reset_finished": True}, "openpi"))
         instruction = reading.text(message, PROMPT_KEY)
@@ -67,14 +67,14 @@ def _demonstration(message: Mapping[Any, Any], terms: Terms) -> Sequence[Frames]
     """The conditioning video; every camera of ours shows it, and PONDER reads as many as its contract says."""
     if DEMO_KEY not in message:
         return ()
-    return reading.videos(dict.fromkeys(terms.cameras, message[DEMO_KEY]))
+    return reading.videos(dict.fromkeys(terms.cameras, reading.listed(message[DEMO_KEY], DEMO_KEY)))
 
 
 def _rate(message: Mapping[Any, Any]) -> int:
     """Frames per second of the conditioning video; 0: the control rate. Raises Refused if it is none."""
     rate_hz = message.get(DEMO_HZ_KEY, 0)
     if not isinstance(rate_hz, int | np.integer) or not 0 <= rate_hz <= MAX_DEMO_HZ:
-        raise Refused(f"{DEMO_HZ_KEY}: expected frames per second, 1 to {MAX_DEMO_HZ}, came {str(rate_hz)[:80]}")
+        raise Refused(f"{DEMO_HZ_KEY}: expected frames per second, 1 to {MAX_DEMO_HZ}, came {reading.shown(rate_hz)}")
     return int(rate_hz)
 
 

@@ -15,7 +15,7 @@ from clock import schedules
 from clock.policies import SERVERS, PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from protocol import files
-from protocol.checks import MAX_HORIZON
+from protocol.checks import MAX_HORIZON, MAX_IMAGE_SIDE_PX, MAX_INDEX, MAX_INSTANT_NS
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Mode, Schedule, WaitKind
 from protocol.options import DaemonOptions, LinkOptions
@@ -29,6 +29,9 @@ from sim_client.gateway.machine import Plan
 
 MAX_SEATS = 64
 """Each is a thread, a bus and, in real time, a clock of its own: more robots want another gateway on another host."""
+
+_MAX_MB = 1 << 20
+_MAX_MS = MAX_INSTANT_NS // NS_PER_MS
 
 DialectName = Literal[
     "ponderpounce", "openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5", "lerobot"
@@ -131,8 +134,8 @@ class GatewayOptions:
     schedule runs by itself, and a request is answered immediately with the action commanded at that moment. None:
     realtime for the dialects ponderpounce and lerobot, lockstep for the others."""
     rows: int | None = None
-    """Number of rows in an answer, played by the client before its next request. None: 1, 20 for the challenge, and the
-    mapping file's horizon for GR00T and LeRobot."""
+    """Number of rows in an answer, played by the client before its next request. None: 1, 20 for the challenge, 16 for
+    mme-vla, and the mapping file's horizon for GR00T and LeRobot."""
     robot_file: Path | None = None
     """TOML description of the robot, see docs/robots.md. None: the Panda of our tasks and of RoboMME."""
     cameras: tuple[str, ...] = ()
@@ -174,6 +177,8 @@ class GatewayOptions:
         if self.ponder == "none" and self.ponder_checkpoint is not None:
             raise TransportError("--ponder none starts no PONDER: leave --ponder-checkpoint out")
         host, _ = self.address
+        self._check_limits()
+        self._check_ports()
         if self.dialect in _MAPPED and self.mapping is None:
             raise TransportError(f"--dialect {self.dialect} needs a --mapping file: its clients name every number")
         rows = self.terms().rows
@@ -209,6 +214,38 @@ class GatewayOptions:
         if self.dialect == "lerobot" and not _is_loopback(host):
             raise TransportError(f"--listen {self.listen}: LeRobot's clients have neither key nor TLS; use a tunnel")
 
+    def _check_limits(self) -> None:
+        """Raises TransportError for a number that nothing could be done with."""
+        timing, clients = self.timing, self.clients
+        for option, value, low, high in (
+            ("--image-px", self.image_px, 1, MAX_IMAGE_SIDE_PX),
+            ("--max-message-mb", clients.max_message_mb, 1, _MAX_MB),
+            ("--max-memory-mb", clients.max_memory_mb, 1, _MAX_MB),
+            ("--query-period-ms", timing.query_period_ms, 0, _MAX_MS),
+            ("--invoke-every-ticks", timing.invoke_every_ticks, 1, MAX_INDEX),
+            ("--delay-ms", timing.delay_ms, 0, _MAX_MS),
+            ("--max-age-ms", timing.max_age_ms, 0, _MAX_MS),
+            ("--stale-limit-ms", timing.stale_limit_ms, 0, _MAX_MS),
+        ):
+            if value is not None and not low <= value <= high:
+                raise TransportError(f"{option} {value}: expected {low} to {high}")
+
+    def _check_ports(self) -> None:
+        """Raises TransportError for a port that is taken twice, and for a page that other hosts could reach."""
+        if self.watch is not None and not _is_loopback(_address("--watch", self.watch)[0]):
+            raise TransportError(
+                f"--watch {self.watch} can be reached from other hosts: use 127.0.0.1, or start "
+                "pp-replay watch --open-to-anyone beside the gateway"
+            )
+        given = {"--listen": self.listen, "--watch": self.watch, "--metrics": self.operations.metrics}
+        taken: dict[int, str] = {}
+        for option, where in given.items():
+            port = _address(option, where)[1] if where is not None else 0
+            if port in taken:
+                raise TransportError(f"{option} {where}: expected another port than that of {taken[port]}")
+            if port:  # 0 is whichever is free
+                taken[port] = f"{option} {where}"
+
     def _check_mapping(self, mapping: PolicyMapping) -> None:
         """Raises TransportError or FileError for a client that this robot could not be."""
         assert self.mapping is not None, "it was read"
@@ -232,10 +269,7 @@ class GatewayOptions:
     @property
     def address(self) -> tuple[str, int]:
         """Host and port of ``listen``. Raises TransportError if it is not HOST:PORT."""
-        host, _, port = self.listen.rpartition(":")
-        if not host or not port.isdecimal() or int(port) > 65535:
-            raise TransportError(f"--listen {self.listen!r}: expected HOST:PORT, e.g. 127.0.0.1:8000")
-        return host.strip("[]"), int(port)
+        return _address("--listen", self.listen)
 
     @property
     def runs_clock_daemon(self) -> bool:
@@ -326,6 +360,14 @@ class GatewayOptions:
             idle_ns=round(self.clients.idle_s * 1e9),
             waits_for_person=self.dialect in _LIVE,
         )
+
+
+def _address(option: str, where: str) -> tuple[str, int]:
+    """Host and port. Raises TransportError for anything else."""
+    host, _, port = where.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise TransportError(f"{option} {where!r}: expected HOST:PORT, e.g. 127.0.0.1:8000")
+    return host.strip("[]"), int(port)
 
 
 def _is_loopback(host: str) -> bool:

@@ -25,6 +25,7 @@ STATE_KEY = "state"
 EXPIRY_TICKS = 3
 """Ticks after its deadline at which a command expires: the robot's own watchdog stops it unless another has come."""
 MAX_TEXT = 500
+_KINDS = "time, begin, observe or end"
 _STATES = {state.name.lower(): state for state in RobotState if state}
 
 
@@ -72,21 +73,23 @@ class PonderpounceDialect:
     def read(self, packet: Packet) -> ClientRequest:
         self._seq = 0
         message = reading.message(packet)
-        kind, seq = message.get("kind"), message.get("seq")
+        seq = message.get("seq")
         if type(seq) is not int or not 0 <= seq < 1 << 63:
-            raise Refused(f"seq: expected the number of this message, came {str(seq)[:80]!r}")
+            raise Refused(f"seq: expected the number of this message, came {reading.shown(seq)}")
         self._seq = seq
+        kind = reading.word(message.get("kind"), "kind", _KINDS)
         if kind == "time":
             return ClientRequest(None, seq, reply=_message("time", seq, now_ns=time.monotonic_ns()))
         if kind == "begin":
+            is_dry = reading.truth(message.get("dry_run", False), "dry_run")
             self._instruction, self._told_tick = reading.text(message, "instruction"), -1
-            trial = Trial(speed=_speed(message), is_dry=message.get("dry_run") is True)
+            trial = Trial(speed=_speed(message), is_dry=is_dry)
             return ClientRequest(self._step(message, trial), seq, reply=_message("begun", seq))
         if kind == "observe":
             return ClientRequest(self._step(message, None), seq)
         if kind == "end":
             return ClientRequest(_outcome(message), seq, reply=_message("ended", seq))
-        raise Refused(f"kind: expected time, begin, observe or end, came {str(kind)[:80]!r}")
+        raise Refused(f"kind: expected {_KINDS}, came {reading.shown(kind)}")
 
     def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
         self._told_tick = answer.tick
@@ -111,23 +114,23 @@ class PonderpounceDialect:
         return {name: _instant(given, key) for name, key in self._terms.cameras.items() if key in given}
 
     def _step(self, message: Mapping[Any, Any], trial: Trial | None) -> Step:
-        key, said = self._terms.state_key, message.get("robot_state", "ok")
-        if not isinstance(said, str) or said not in _STATES:
-            raise Refused(f"robot_state: expected {', '.join(_STATES)}, came {str(said)[:80]!r}")
+        key, states = self._terms.state_key, ", ".join(_STATES)
+        said = reading.word(message.get("robot_state", "ok"), "robot_state", states)
+        if said not in _STATES:
+            raise Refused(f"robot_state: expected {states}, came {reading.shown(said)}")
         pictures = reading.field(message, "images", "pictures by camera")
         if not isinstance(pictures, Mapping):
             raise Refused(f"images: expected pictures by camera, came {type(pictures).__name__}")
-        task = message.get("task", "")
         return Step(
             instruction=self._instruction,
             frames=reading.frames(pictures, self._terms.cameras),
             state=reading.numbers(reading.field(message, key, "the measured joints"), key, self._terms.num_proprio),
             begins=trial is not None,
-            task=task if isinstance(task, str) else "",
+            task=reading.word(message.get("task", ""), "task"),
             taken_ns=_instant(message, "state_ns"),
             captured_ns=self._captured_ns(message),
             robot_state=_STATES[said],
-            robot_text=str(message.get("robot_text", ""))[:MAX_TEXT],
+            robot_text=reading.word(message.get("robot_text", ""), "robot_text")[:MAX_TEXT],
             after_tick=self._told_tick,
             trial=trial,
         )
@@ -136,24 +139,23 @@ class PonderpounceDialect:
 def _instant(message: Mapping[Any, Any], key: str) -> int:
     value = reading.field(message, key, "an instant on this host's monotonic clock")
     if type(value) is not int or abs(value) >= 1 << 62:
-        raise Refused(f"{key}: expected nanoseconds, came {str(value)[:80]!r}")
+        raise Refused(f"{key}: expected nanoseconds, came {reading.shown(value)}")
     return value
 
 
 def _speed(message: Mapping[Any, Any]) -> float:
     value = message.get("speed", 1.0)
     if type(value) not in (int, float) or not 0.1 <= value <= 1:
-        raise Refused(f"speed: expected 0.1 to 1, the share of the robot's step limits, came {str(value)[:80]!r}")
+        raise Refused(f"speed: expected 0.1 to 1, the share of the robot's step limits, came {reading.shown(value)}")
     return float(value)
 
 
 def _outcome(message: Mapping[Any, Any]) -> Finish:
-    success, reason = message.get("success"), str(message.get("reason", ""))[:MAX_TEXT]
+    success, reason = message.get("success"), reading.word(message.get("reason", ""), "reason")[:MAX_TEXT]
     if success is None:
         return Finish(reason=reason or "the robot's program ended it")
-    return Finish(
-        status=TaskStatus.SUCCESS if success else TaskStatus.FAIL, reason=reason or "says the robot's program"
-    )
+    status = TaskStatus.SUCCESS if reading.truth(success, "success") else TaskStatus.FAIL
+    return Finish(status=status, reason=reason or "says the robot's program")
 
 
 def _message(kind: str, seq: int, **values: Any) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hmac
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -48,23 +49,57 @@ def text(values: Mapping[Any, Any], key: str) -> str:
         with contextlib.suppress(UnicodeDecodeError):
             value = value.decode()
     if not isinstance(value, str) or not value.strip():
-        raise Refused(f"{key}: expected a sentence that says what to do, came {str(value)[:80]!r}")
+        raise Refused(f"{key}: expected a sentence that says what to do, came {shown(value)}")
     return value
+
+
+def word(value: Any, key: str, expected: str = "a text") -> str:
+    """A text of the protocol's own, such as the kind of a message. Raises Refused for anything else."""
+    if not isinstance(value, str):
+        raise Refused(f"{key}: expected {expected}, came {shown(value)}")
+    return value
+
+
+def truth(value: Any, key: str) -> bool:
+    """A truth value, plain or as the only item of a list or an array. Raises Refused for anything else."""
+    items = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+    only = items[0] if isinstance(items, list) and len(items) == 1 else items
+    if not isinstance(only, bool | np.bool_):
+        raise Refused(f"{key}: expected true or false, came {shown(value)}")
+    return bool(only)
+
+
+def is_secret(value: Any, secret: str) -> bool:
+    """Whether a client sent ``secret``. The time that this takes says nothing of how much of it was right."""
+    return isinstance(value, str) and hmac.compare_digest(value.encode(), secret.encode())
+
+
+def listed(value: Any, key: str) -> Sequence[Any]:
+    """A list, or an array with an axis to go along. Raises Refused for anything else."""
+    is_list = value.ndim > 0 if isinstance(value, np.ndarray) else isinstance(value, list)
+    if not is_list:
+        raise Refused(f"{key}: expected a list, came {shown(value)}")
+    return value  # type: ignore[no-any-return]
+
+
+def vector(value: Any, name: str, expected: str = "numbers") -> Floats:
+    """Numbers in one row, as float32. Raises Refused for what holds anything else, or lists that are not alike."""
+    try:
+        return np.asarray(value, np.float32).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise Refused(f"{name}: expected {expected}, came {shown(value)}") from None
 
 
 def numbers(value: Any, name: str, expected: int) -> Floats:
     """One vector of ``expected`` finite numbers, as float32."""
-    try:
-        vector = np.asarray(value, np.float32).ravel()
-    except (TypeError, ValueError, OverflowError):
-        raise Refused(f"{name}: expected {expected} numbers, came {type(value).__name__}") from None
-    if len(vector) != expected:
+    found = vector(value, name, f"{expected} numbers")
+    if len(found) != expected:
         raise Refused(
-            f"{name}: expected {expected} numbers, came {len(vector)}. A robot of another build needs --robot-file."
+            f"{name}: expected {expected} numbers, came {len(found)}. A robot of another build needs --robot-file."
         )
-    if not np.isfinite(vector).all():
-        raise Refused(f"{name}: expected finite numbers, came {vector.tolist()}")
-    return vector
+    if not np.isfinite(found).all():
+        raise Refused(f"{name}: expected finite numbers, came {found.tolist()}")
+    return found
 
 
 def picture(value: Any, name: str) -> NDArray[np.uint8]:
@@ -116,17 +151,17 @@ def _pictures_in(values: Mapping[Any, Any]) -> Iterator[str]:
                 yield f"{name}/{inner}" if inner else str(name)
 
 
-def videos(streams: Mapping[str, Any]) -> Sequence[Frames]:
+def videos(streams: Mapping[str, Sequence[Any]]) -> Sequence[Frames]:
     """Lists of frames, one per camera, as one list of instants; its pictures are decoded when they are read."""
-    lengths = {name: len(stream) for name, stream in streams.items() if isinstance(stream, Sequence | np.ndarray)}
-    if len(lengths) != len(streams) or len(set(lengths.values())) > 1:
-        came = ", ".join(f"{name}: {lengths.get(name, 'no list')}" for name in streams)
+    lengths = {name: len(stream) for name, stream in streams.items()}
+    if len(set(lengths.values())) > 1:
+        came = ", ".join(f"{name}: {length}" for name, length in lengths.items())
         raise Refused(f"expected a list of frames per camera, equally long, came {came}")
     return _Video(streams, next(iter(lengths.values()), 0))
 
 
 class _Video(Sequence[Frames]):
-    def __init__(self, streams: Mapping[str, Any], length: int) -> None:
+    def __init__(self, streams: Mapping[str, Sequence[Any]], length: int) -> None:
         self._streams, self._length = streams, length
 
     def __len__(self) -> int:
@@ -136,6 +171,13 @@ class _Video(Sequence[Frames]):
         if isinstance(index, slice):
             return [self[position] for position in range(*index.indices(self._length))]
         return {name: picture(stream[index], name) for name, stream in self._streams.items()}
+
+
+def shown(value: Any) -> str:
+    """A client's value in an error: a plain one itself, of others the type, and of an array the shape."""
+    if value is None or isinstance(value, bool | int | float | str | bytes | np.generic):
+        return repr(value[:80] if isinstance(value, str | bytes) else value)
+    return f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 
 def _names(values: Mapping[Any, Any]) -> str:

@@ -55,8 +55,9 @@ class VlaEvalDialect:
         if kind == "observation":
             return ClientRequest(self._observation(payload), seq)
         if kind == "episode_end":
+            finish = _outcome(payload)
             self._in_episode = False
-            return ClientRequest(_outcome(payload), seq)
+            return ClientRequest(finish, seq)
         if kind == "error":
             return ClientRequest(None, seq)
         raise Refused(f"expected a message of vla-eval 0.8, came type {kind[:80]!r}")
@@ -70,8 +71,9 @@ class VlaEvalDialect:
 
     def _hello(self, payload: Mapping[Any, Any]) -> ClientRequest:
         theirs = payload.get("protocol_version", PROTOCOL_VERSION)
-        if theirs != PROTOCOL_VERSION:
-            raise Refused(f"expected protocol version {PROTOCOL_VERSION} (vla-eval 0.8), came {theirs!r}")
+        if type(theirs) is not int or theirs != PROTOCOL_VERSION:
+            came = reading.shown(theirs)
+            raise Refused(f"protocol_version: expected protocol version {PROTOCOL_VERSION} (vla-eval 0.8), came {came}")
         hello = {
             "harness_version": f"ponderpounce {self._terms.version}",
             "protocol_version": PROTOCOL_VERSION,
@@ -85,16 +87,22 @@ class VlaEvalDialect:
     def _start(self, payload: Mapping[Any, Any]) -> ClientRequest:
         """Nothing opens yet: the instruction and the video come with the first observation."""
         task = payload.get("task")
-        name = task.get("name", "") if isinstance(task, Mapping) else ""
-        ours = "live" if self._terms.mode == Mode.REALTIME else "sync"
-        theirs = payload.get("mode", "sync")
-        self._objection = ""
-        if theirs != ours:
-            way_out = "realtime" if theirs == "live" else "lockstep"
-            self._objection = f"the harness runs {theirs}, this gateway {ours}: start pp-gateway with --mode {way_out}"
+        name = task.get("name") if isinstance(task, Mapping) else None
+        self._objection = self._objection_to(payload.get("mode", "sync"))
         was_open, self._in_episode, self._begins = self._in_episode, True, True
         self._task = name if isinstance(name, str) else ""
         return ClientRequest(Finish() if was_open else None, self._seq)
+
+    def _objection_to(self, mode: Any) -> str:
+        """Why a harness that runs in this mode is not served; "" if it is."""
+        ours = "live" if self._terms.mode == Mode.REALTIME else "sync"
+        try:
+            theirs = reading.word(mode, "mode", "sync or live")
+        except Refused as error:
+            return str(error)
+        way_out = "realtime" if theirs == "live" else "lockstep"
+        said = f"the harness runs {theirs[:80]}, this gateway {ours}: start pp-gateway with --mode {way_out}"
+        return "" if theirs == ours else said
 
     def _observation(self, payload: Mapping[Any, Any]) -> Step:
         if not self._in_episode:
@@ -119,12 +127,12 @@ class VlaEvalDialect:
 
     def _demo(self, payload: Mapping[Any, Any]) -> Any:
         """The conditioning video. A benchmark that films it with one camera shows that picture to every other."""
-        front = payload.get("video_history")
-        if front is None:
+        if payload.get(VIDEOS["front"]) is None:
             no_frames: tuple[Frames, ...] = ()
             return no_frames
-        videos = {name: payload.get(VIDEOS.get(name, ""), front) for name in self._terms.cameras}
-        return reading.videos(videos)
+        keys = {name: VIDEOS.get(name, "") for name in self._terms.cameras}
+        found = {name: key if key in payload else VIDEOS["front"] for name, key in keys.items()}
+        return reading.videos({name: reading.listed(payload[key], key) for name, key in found.items()})
 
 
 def _outcome(payload: Mapping[Any, Any]) -> Finish:
@@ -132,8 +140,9 @@ def _outcome(payload: Mapping[Any, Any]) -> Finish:
     success = metrics.get("success") if isinstance(metrics, Mapping) else None
     if success is None:
         return Finish()
-    status = TaskStatus.SUCCESS if success else TaskStatus.FAIL
-    return Finish(status=status, reason=f"says the harness, after {payload.get('steps', 'unknown')} steps")
+    status = TaskStatus.SUCCESS if reading.truth(success, "metrics.success") else TaskStatus.FAIL
+    steps = reading.shown(payload["steps"]) if "steps" in payload else "unknown"
+    return Finish(status=status, reason=f"says the harness, after {steps} steps")
 
 
 def _message(kind: str, payload: Mapping[str, Any], seq: int) -> bytes:

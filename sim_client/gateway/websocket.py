@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import http
 import json
 import logging
@@ -18,7 +17,8 @@ from websockets.http11 import Request, Response
 
 from protocol.errors import TransportError
 from protocol.messages import Mode
-from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Finish, Packet, Refused, Terms
+from sim_client.gateway import reading
+from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Finish, Packet, Refused, Terms, refusal
 from sim_client.gateway.memory import Memory, counted
 from sim_client.gateway.openpi import metadata
 
@@ -63,13 +63,19 @@ class WebsocketSide:
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers health checks and metadata requests in plain HTTP; None lets the websocket begin."""
-        if request.path in ("/healthz", "/health"):
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
-        if not is_allowed(request.headers.get("Authorization"), self.api_key):
-            return connection.respond(http.HTTPStatus.UNAUTHORIZED, KEY_WANTED)
-        if request.path == "/metadata":
-            return connection.respond(http.HTTPStatus.OK, json.dumps(metadata(self.terms)) + "\n")
-        return None
+        path = route(request.path)
+        if path in ("/healthz", "/health"):
+            status, text = http.HTTPStatus.OK, "OK\n"
+        elif not is_allowed(request.headers.get("Authorization"), self.api_key):
+            status, text = http.HTTPStatus.UNAUTHORIZED, KEY_WANTED
+        elif path == "/metadata":
+            status, text = http.HTTPStatus.OK, json.dumps(metadata(self.terms)) + "\n"
+        else:
+            return None
+        response = connection.respond(status, text)
+        if getattr(request, "method", "GET") == "HEAD":  # older websockets know GET alone
+            response.body = b""
+        return response
 
     async def _converse(self, connection: ServerConnection) -> None:
         host, port, *_ = connection.remote_address
@@ -85,11 +91,10 @@ class WebsocketSide:
                 try:
                     asked = await asyncio.to_thread(dialect.read, packet)
                     future = self.door.submit(client, asked.request) if asked.request is not None else None
-                except Refused as error:
-                    log.warning("client=%s refused: %s", client, error)
-                    await connection.send(dialect.refuse(str(error)))
+                except Exception as error:
+                    await connection.send(dialect.refuse(str(refusal(error, client))))
                     continue
-                task = asyncio.create_task(self._reply(connection, dialect, asked, future))
+                task = asyncio.create_task(self._reply(connection, client, dialect, asked, future))
                 under_way.add(task)
                 task.add_done_callback(under_way.discard)
                 while len(under_way) >= self._most_under_way:
@@ -111,13 +116,18 @@ class WebsocketSide:
         return 1 if self.terms.mode == Mode.LOCKSTEP else LIVE_UNDER_WAY
 
     async def _reply(
-        self, connection: ServerConnection, dialect: Dialect, asked: ClientRequest, future: Future[Answer | None] | None
+        self,
+        connection: ServerConnection,
+        client: str,
+        dialect: Dialect,
+        asked: ClientRequest,
+        future: Future[Answer | None] | None,
     ) -> None:
         try:
             answer = await asyncio.wrap_future(future) if future is not None else None
             packet: Packet | None = asked.reply if answer is None else dialect.answer(asked, answer)
-        except Refused as error:
-            packet = dialect.refuse(str(error))
+        except Exception as error:
+            packet = dialect.refuse(str(refusal(error, client)))
         if packet is not None:
             try:
                 await connection.send(packet)
@@ -125,9 +135,14 @@ class WebsocketSide:
                 return  # the conversation's own loop reports it
 
 
+def route(path: str) -> str:
+    """The path of a request without its query and without slashes at its end."""
+    return path.partition("?")[0].rstrip("/")
+
+
 KEY_WANTED = "expected the header Authorization: Api-Key WORD, with the word in --api-key-file\n"
 
 
 def is_allowed(authorization: str | None, api_key: str) -> bool:
     """Whether a client is admitted."""
-    return not api_key or hmac.compare_digest((authorization or "").encode(), f"Api-Key {api_key}".encode())
+    return not api_key or reading.is_secret(authorization, f"Api-Key {api_key}")

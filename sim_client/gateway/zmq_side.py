@@ -11,17 +11,28 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future
+from typing import NamedTuple
 
 import zmq
 
 from protocol.errors import TransportError
-from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Packet, Refused, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Packet, Terms, refusal
 
 log = logging.getLogger("pp-gateway")
 
 _IDLE_MS, _PENDING_MS = 50, 2
 _MAX_WAITING = 4  # requests of one client that are not read yet
 _MAX_CLIENTS = 64
+
+
+class _Pending(NamedTuple):
+    """A request whose answer is awaited."""
+
+    identity: bytes
+    client: str
+    dialect: Dialect
+    asked: ClientRequest
+    future: Future[Answer | None]
 
 
 class ZmqSide:
@@ -41,7 +52,7 @@ class ZmqSide:
     ) -> None:
         self._door, self._terms, self._new_dialect = door, terms, new_dialect
         self._dialects: OrderedDict[str, Dialect] = OrderedDict()
-        self._pending: list[tuple[bytes, Dialect, ClientRequest, Future[Answer | None]]] = []
+        self._pending: list[_Pending] = []
         self._should_stop = threading.Event()
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -82,20 +93,19 @@ class ZmqSide:
             if asked.request is None:
                 self._send(identity, asked.reply)
                 return
-            self._pending.append((identity, dialect, asked, self._door.submit(client, asked.request)))
-        except Refused as error:
-            log.warning("client=%s refused: %s", client, error)
-            self._send(identity, dialect.refuse(str(error)))
+            self._pending.append(_Pending(identity, client, dialect, asked, self._door.submit(client, asked.request)))
+        except Exception as error:
+            self._send(identity, dialect.refuse(str(refusal(error, client))))
 
     def _reply(self) -> None:
-        for each in [each for each in self._pending if each[3].done()]:
+        for each in [each for each in self._pending if each.future.done()]:
             self._pending.remove(each)
-            identity, dialect, asked, future = each
             try:
-                answer = future.result()
-                self._send(identity, asked.reply if answer is None else dialect.answer(asked, answer))
-            except Refused as error:
-                self._send(identity, dialect.refuse(str(error)))
+                answer = each.future.result()
+                packet = each.asked.reply if answer is None else each.dialect.answer(each.asked, answer)
+            except Exception as error:
+                packet = each.dialect.refuse(str(refusal(error, each.client)))
+            self._send(each.identity, packet)
 
     def _send(self, identity: bytes, packet: Packet | None) -> None:
         data = packet.encode() if isinstance(packet, str) else packet or b""

@@ -8,6 +8,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from protocol.peers.lerobot import Code, Envelope, WireError, unpack
 from protocol.peers.mapping import Camera, Numbers, PolicyMapping, Prompt
 from sim_client.gateway.exchange import Answer, Behind, Terms
 from sim_client.gateway.lerobot import ALIGNED, Deployment, Session, capabilities, check_mapping
-from sim_client.gateway.lerobot_side import LerobotSide
+from sim_client.gateway.lerobot_side import LerobotSide, _Pending
 from sim_client.gateway.seats import Seats
 from sim_client.launch import free_ports
 
@@ -616,6 +617,19 @@ def test_whatever_comes_is_answered_and_ends_nothing(
         )
         assert envelope.kind != "error" or envelope.body["code"] in list(Code)
     assert not silent_side.deployment.sessions
+
+
+def test_an_answer_that_fails_is_an_error_to_its_client_and_ends_nothing(silent_side: LerobotSide) -> None:
+    future: Future[Answer | None] = Future()
+    future.set_exception(ZeroDivisionError("a defect"))
+    answers: list[bytes] = []
+    session = Session(silent_side.deployment.terms, "sha", is_aligned=False)
+    waiting = Envelope(kind="observation", session_id=session.id, request_id="r")
+    silent_side._pending.append(_Pending(waiting, session, future, answers.append))
+    silent_side._reply()
+    (told,) = map(unpack, answers)
+    assert (told.kind, told.request_id, told.body["code"]) == ("error", "r", Code.EXECUTION)
+    assert told.body["message"] == "the gateway failed: ZeroDivisionError: a defect"
 
 
 def _is_whole(body: Any, version: Any) -> bool:

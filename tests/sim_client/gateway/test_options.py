@@ -12,6 +12,7 @@ from dual_system.tasks.panda import HOME_QPOS
 from protocol.checks import check_schedule
 from protocol.errors import FileError, TransportError
 from protocol.messages import DelayKind, Mode
+from protocol.options import DaemonOptions
 from sim_client.gateway.body import PANDA, ROBOMME, Body, read_body
 from sim_client.gateway.options import ClientsOptions, GatewayOptions, ScheduleOptions
 
@@ -42,6 +43,23 @@ is_simulated = true
         ({"listen": "robot.example:8000"}, "can be reached from other hosts"),
         ({"dialect": "vla-eval", "clients": ClientsOptions(api_key_file=Path("key"))}, "vla-eval sends no key"),
         ({"cameras": ("front",)}, "expected NAME=KEY"),
+        ({"image_px": 0}, "--image-px 0: expected 1 to 4096"),
+        ({"image_px": 5000}, "--image-px 5000: expected 1 to 4096"),
+        ({"clients": ClientsOptions(max_message_mb=-1)}, "--max-message-mb -1: expected 1 to"),
+        ({"clients": ClientsOptions(max_memory_mb=0)}, "--max-memory-mb 0: expected 1 to"),
+        ({"timing": ScheduleOptions(query_period_ms=-5)}, "--query-period-ms -5: expected 0 to"),
+        ({"timing": ScheduleOptions(query_period_ms=10**13)}, f"--query-period-ms {10**13}: expected 0 to"),
+        ({"timing": ScheduleOptions(invoke_every_ticks=0)}, "--invoke-every-ticks 0: expected 1 to"),
+        ({"timing": ScheduleOptions(delay_ms=-1)}, "--delay-ms -1: expected 0 to"),
+        ({"timing": ScheduleOptions(max_age_ms=-1)}, "--max-age-ms -1: expected 0 to"),
+        ({"timing": ScheduleOptions(stale_limit_ms=-1)}, "--stale-limit-ms -1: expected 0 to"),
+        ({"watch": "8090"}, "--watch '8090': expected HOST:PORT"),
+        ({"watch": "0.0.0.0:8090"}, "--watch 0.0.0.0:8090 can be reached from other hosts"),
+        ({"watch": "localhost:8000"}, "--watch localhost:8000: expected another port than that of --listen 127.0.0.1"),
+        (
+            {"watch": "127.0.0.1:9448", "operations": DaemonOptions(metrics="127.0.0.1:9448")},
+            "--metrics 127.0.0.1:9448: expected another port than that of --watch",
+        ),
     ],
 )
 def test_what_cannot_work_is_refused(options: dict[str, Any], sentence: str) -> None:
@@ -62,6 +80,9 @@ def test_what_cannot_work_is_refused(options: dict[str, Any], sentence: str) -> 
         {"listen": "0.0.0.0:8000", "clients": ClientsOptions(open_to_anyone=True)},
         {"listen": "0.0.0.0:8000", "clients": ClientsOptions(api_key_file=Path("key"))},
         {"cameras": ("front=image", "wrist=images/hand")},
+        {"image_px": 1, "timing": ScheduleOptions(query_period_ms=0, delay_ms=0)},
+        {"watch": "127.0.0.1:8090", "operations": DaemonOptions(metrics="127.0.0.1:9448")},
+        {"listen": "127.0.0.1:0", "watch": "127.0.0.1:0"},
     ],
 )
 def test_what_works_is_accepted(options: dict[str, Any]) -> None:

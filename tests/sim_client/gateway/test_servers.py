@@ -158,15 +158,6 @@ def test_a_flood_is_read_no_faster_than_it_is_answered(
             time.sleep(0.01)
 
 
-@pytest.mark.parametrize("path", ["/healthz", "/health", "/metadata"])
-def test_plain_http_gets_answers_beside_the_websocket(openpi_port: int, path: str) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", openpi_port, timeout=20)
-    connection.request("GET", path)
-    reply = connection.getresponse()
-    assert (reply.status, b"control_hz" in reply.read()) == (200, path == "/metadata")
-    connection.close()
-
-
 def test_without_the_key_nobody_comes_in(
     bench: Any, terms_with: Callable[..., Terms], listening: Callable[..., Any]
 ) -> None:
@@ -187,6 +178,7 @@ class ChallengeClient:
     """``reset`` and ``infer`` over HTTP; plays every row of an answer and brings back all it saw."""
 
     def __init__(self, port: int) -> None:
+        self.port = port
         self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
 
     def call(self, method: str, path: str, message: Any = None, **headers: str) -> tuple[int, bytes]:
@@ -269,3 +261,47 @@ def test_over_http_what_cannot_be_used_is_told_and_the_next_request_is_served(
 def test_over_http_an_episode_that_was_not_begun_is_refused(challenger: ChallengeClient, picture_of: PictureOf) -> None:
     status, body = challenger.call("POST", "/infer", _inputs(picture_of, [np.zeros(2)] * 20, first=False))
     assert (status, b"no episode is open" in body) == (400, True)
+
+
+# -- plain HTTP
+
+
+@pytest.fixture(params=["websocket", "http"])
+def plain_port(request: pytest.FixtureRequest) -> int:
+    """The port of either side that answers plain HTTP."""
+    if request.param == "websocket":
+        return int(request.getfixturevalue("openpi_port"))
+    return int(request.getfixturevalue("challenger").port)
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/healthz/", "/healthz?x=1", "/healthz/?x=/a", "/metadata", "/metadata?"])
+def test_plain_http_gets_answers_and_head_gets_their_length(plain_port: int, path: str) -> None:
+    replies = []
+    for method in ("GET", "HEAD"):
+        connection = http.client.HTTPConnection("127.0.0.1", plain_port, timeout=20)
+        connection.request(method, path)
+        reply = connection.getresponse()
+        replies.append((reply.status, reply.headers["Content-Length"], reply.read()))
+        connection.close()
+    (status, length, body), head = replies
+    assert (status, length, b"control_hz" in body) == (200, str(len(body)), path.startswith("/metadata"))
+    assert head == (status, length, b"")
+
+
+def test_after_head_the_connection_over_http_is_in_step(challenger: ChallengeClient) -> None:
+    assert challenger.call("HEAD", "/healthz") == (200, b"")
+    assert challenger.call("GET", "/healthz") == (200, b"OK\n")
+
+
+def test_vla_eval_asks_for_health_under_its_own_name(openpi_port: int) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", openpi_port, timeout=20)
+    connection.request("GET", "/health")
+    assert connection.getresponse().status == 200
+    connection.close()
+
+
+def test_plain_http_finds_no_other_path(plain_port: int) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", plain_port, timeout=20)
+    connection.request("GET", "/healthz/x")
+    assert connection.getresponse().status in (404, 426)
+    connection.close()
