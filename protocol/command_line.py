@@ -33,6 +33,7 @@ Main = Callable[..., int]
 
 _GONE = frozenset({"--link.no-shared-memory"})
 """Options that scripts may still name, and that ask for what is done anyway."""
+_MOST = 1_000_000_000  # in seconds more than anybody waits, and in all units few enough to be counted in ns
 _UNITS = ("_s", "_ms", "_hz", "_px", "_mb", "_ticks")
 REFUSED, INTERRUPTED, READER_LEFT = 2, 130, 141  # the latter two as a shell counts SIGINT and SIGPIPE
 
@@ -126,7 +127,7 @@ def parse(kind: type[Options], argv: Sequence[str] | None, *, prog: str) -> Opti
     """Returns the options in ``argv`` (None: the process's). Exits the process after ``--help`` or an error.
 
     Raises:
-        ValueError: a number is not finite; a quantity with a unit, or a seed, is negative.
+        ValueError: a number is not finite; a quantity with a unit is negative or above 1e9; a seed is negative.
     """
     argv = [argument for argument in (sys.argv[1:] if argv is None else argv) if argument not in _GONE]
     options = tyro.cli(kind, args=argv, prog=prog, description=kind.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
@@ -143,7 +144,9 @@ def _check_numbers(options: Any) -> None:
             option = f"--{name.replace('_', '-')}"
             if not abs(value) < math.inf:
                 raise ValueError(f"{option}: expected a finite number, came {value}")
-            if value < 0 and (name == "seed" or name.endswith(_UNITS)):
+            if name.endswith(_UNITS) and not 0 <= value <= _MOST:
+                raise ValueError(f"{option}: expected a number from 0 to {_MOST}, came {value}")
+            if name == "seed" and value < 0:
                 raise ValueError(f"{option}: expected a number of at least 0, came {value}")
 
 

@@ -61,10 +61,10 @@ def word(value: Any, key: str, expected: str = "a text") -> str:
 
 
 def truth(value: Any, key: str) -> bool:
-    """A truth value, plain or as the only item of a list or an array. Raises Refused for anything else."""
+    """A truth value, or 0 or 1, plain or as the only item of a list or an array. Raises Refused for anything else."""
     items = value.ravel().tolist() if isinstance(value, np.ndarray) else value
     only = items[0] if isinstance(items, list) and len(items) == 1 else items
-    if not isinstance(only, bool | np.bool_):
+    if not isinstance(only, bool | int | float | np.generic) or only not in (False, True):
         raise Refused(f"{key}: expected true or false, came {shown(value)}")
     return bool(only)
 

@@ -72,7 +72,8 @@ class Options:
 def test_a_number_that_is_none_or_cannot_be_is_refused_by_its_option_s_name(said: tuple[str, float]) -> None:
     name, value = said
     argv = [f"--{name}={value!r}"]
-    if math.isfinite(value) and (value >= 0 or name == "offset"):
+    most = {"patience-s": 10**9, "delay-ms": 10**9}.get(name, math.inf)
+    if math.isfinite(value) and (0 <= value <= most or name == "offset"):
         options = parse(Options, argv, prog="pp-thing")
         assert {"patience-s": options.timing.patience_s, "offset": options.offset, "delay-ms": options.delay_ms,
                 "seed": options.seed}[name] == value  # fmt: skip

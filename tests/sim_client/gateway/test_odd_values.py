@@ -6,6 +6,7 @@ import contextlib
 import http.client
 import json
 import logging
+import math
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -204,7 +205,12 @@ def test_a_truth_value_may_be_the_only_item(flag: bool, depth: int, is_list: boo
     assert reading.truth(np.bool_(flag), "reset") is reading.truth(flag, "reset") is flag
 
 
-@pytest.mark.parametrize("odd", [None, 0, 1, 1.0, "true", b"\1", [], [True, True], [[True]], np.ones(1), {"a": True}])
+@pytest.mark.parametrize("number", [0, 1, 0.0, 1.0, np.float32(1), np.int64(0), np.ones(1), [0]])
+def test_nought_and_one_are_truth_values(number: Any) -> None:
+    assert reading.truth(number, "success") is bool(np.ravel(number)[0])
+
+
+@pytest.mark.parametrize("odd", [None, 2, -1, 0.5, math.nan, "true", b"\1", [], [True, True], [[True]], {"a": True}])
 def test_what_is_no_truth_value_is_refused_with_its_key(odd: Any) -> None:
     with pytest.raises(Refused, match="reset: expected true or false, came"):
         reading.truth(odd, "reset")
@@ -215,7 +221,7 @@ def test_what_is_no_truth_value_is_refused_with_its_key(odd: Any) -> None:
     [
         ("openpi", 1, ("reset",), np.ones(2, bool), r"reset: expected true or false, came an array of shape \(2,\)"),
         ("openpi", 1, ("demonstration",), np.array(3), r"demonstration: expected a list, came an array of shape \(\)"),
-        ("challenge", 1, ("is_first_step",), 1, "is_first_step: expected true or false, came 1"),
+        ("challenge", 1, ("is_first_step",), 2, "is_first_step: expected true or false, came 2"),
         ("challenge", 1, ("joint_state_list",), np.array(3), "joint_state_list: expected a list"),
         ("challenge", 1, ("joint_state_list", 0), [[1], [2, 3]], "joint_state_list: expected numbers, came list"),
         ("mme-vla", 1, ("add_buffer",), "yes", "add_buffer: expected true or false, came 'yes'"),
@@ -224,9 +230,9 @@ def test_what_is_no_truth_value_is_refused_with_its_key(odd: Any) -> None:
         ("vla-eval", 2, ("payload", "wrist_video_history"), np.array(3), "wrist_video_history: expected a list"),
         ("vla-eval", 3, ("payload", "metrics", "success"), "yes", "metrics.success: expected true or false"),
         ("ponderpounce", 0, ("kind",), np.ones(2), "kind: expected time, begin, observe or end, came an array"),
-        ("ponderpounce", 1, ("dry_run",), 1, "dry_run: expected true or false, came 1"),
+        ("ponderpounce", 1, ("dry_run",), 2, "dry_run: expected true or false, came 2"),
         ("ponderpounce", 2, ("robot_text",), ["a"], "robot_text: expected a text, came list"),
-        ("ponderpounce", 3, ("success",), 1.0, "success: expected true or false, came 1.0"),
+        ("ponderpounce", 3, ("success",), 0.5, "success: expected true or false, came 0.5"),
         ("groot", 0, ("endpoint",), np.ones(2), "endpoint: expected one of ping, .*came an array"),
         ("groot", 0, ("api_token",), np.ones(2), "Unauthorized"),
     ],
