@@ -200,8 +200,9 @@ def tasks_table(instructions: Mapping[str, int]) -> pa.Table:
 
 
 def made(path: Path) -> Path:
+    """Makes a file's folder. Returns the path, absolute: pyarrow takes "run:1" at its beginning for a URI's scheme."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+    return path.absolute()
 
 
 def write_json(path: Path, values: Any) -> None:

@@ -274,13 +274,13 @@ class _Footer:
 def _opened(path: Path) -> pq.ParquetFile:
     require_file(path)
     footer = _footer(path, path.stat().st_mtime_ns)
-    return pq.ParquetFile(path, metadata=footer.about, read_dictionary=footer.texts)
+    return pq.ParquetFile(path.absolute(), metadata=footer.about, read_dictionary=footer.texts)
 
 
 @lru_cache(maxsize=64)
 def _footer(path: Path, changed_ns: int) -> _Footer:
     """Raises ValueError if the file declares more than is read."""
-    about = pq.read_metadata(path)
+    about = pq.read_metadata(path.absolute())  # pyarrow takes "run:1" at the beginning of a path for a URI's scheme
     num_bytes = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
     if about.num_rows > MAX_FILE_ROWS or num_bytes > MAX_FILE_BYTES:
         raise ValueError(

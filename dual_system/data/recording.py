@@ -122,7 +122,7 @@ class RecordingWriter:
         for videos in self._videos.values():
             videos.close()
         pq.write_table(pa.Table.from_pylist(self._episodes), layout.made(self._root / layout.EPISODES_PATH))
-        pq.write_table(layout.tasks_table(self._instructions), self._root / layout.TASKS_PATH)
+        pq.write_table(layout.tasks_table(self._instructions), layout.made(self._root / layout.TASKS_PATH))
         statistics = self._data.statistics()
         statistics |= {layout.video_key(camera): pixels.statistics() for camera, pixels in self._pixels.items()}
         layout.write_json(self._root / layout.STATS_PATH, statistics)
