@@ -18,6 +18,8 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.data.errors import DatasetError
+
 FPS = 20
 CODEC, PIXEL_FORMAT = "h264", "yuv420p"
 FRAMES_PER_KEY = 10
@@ -31,6 +33,12 @@ _OPTIONS = {
 }
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
+
+
+def check_image_px(image_px: int) -> None:
+    """Raises DatasetError unless videos can have square pictures of this side, which is an option's value."""
+    if image_px < 16 or image_px % 2:
+        raise DatasetError(f"--image-px {image_px}: videos need an even number of at least 16")
 
 
 class VideoWriter:
