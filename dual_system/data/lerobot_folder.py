@@ -36,6 +36,7 @@ MAX_TEXT_BYTES = 500_000_000
 """Most text that is read at once: one episode's, or a file of meta/episodes."""
 _NUMBERING = ("index", "episode_index", "frame_index", "timestamp")
 _OLDER = "LeRobot converts older ones: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+_OTHER = "No way from this version is known here; lerobot 0.4.4 and 0.6.1 write the one that is read"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,8 @@ class LeRobotFolder:
         with reading(root / INFO_PATH):
             self.info = read_object(root / INFO_PATH)
         if (version := self._field("codebase_version", str)) != VERSION:
-            raise DatasetError(f"{root} is a LeRobot dataset of version {version}, and {VERSION} is read. {_OLDER}")
+            way_out = _OLDER if version.startswith(("v1.", "v2.")) else _OTHER
+            raise DatasetError(f"{root} is a LeRobot dataset of version {version}, and {VERSION} is read. {way_out}")
         self.fps: float = self._field("fps", int, float)
         if not 0 < self.fps <= 1000:
             raise DatasetError(f"{root / INFO_PATH}: fps is {self.fps}, expected a rate [Hz]")
