@@ -21,6 +21,8 @@ from dual_system.data.video import CODEC, PIXEL_FORMAT, VideoJoiner
 VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
 DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
+MIN_HZ, MAX_HZ = 0.01, 1000
+"""Rates of a folder's rows that are read."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH, TASKS_PATH = "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"

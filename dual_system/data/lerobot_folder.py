@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dual_system.data.errors import DatasetError
-from dual_system.data.lerobot_files import DATA_PATH, INFO_PATH, VERSION, VIDEO_PATH
+from dual_system.data.lerobot_files import DATA_PATH, INFO_PATH, MAX_HZ, MIN_HZ, VERSION, VIDEO_PATH
 from dual_system.data.video import read_frames, read_header
 from dual_system.hub import local_folder
 from protocol.files import read_object, require_file
@@ -72,8 +72,8 @@ class LeRobotFolder:
             way_out = _OLDER if version.startswith(("v1.", "v2.")) else _OTHER
             raise DatasetError(f"{root} is a LeRobot dataset of version {version}, and {VERSION} is read. {way_out}")
         self.fps: float = self._field("fps", int, float)
-        if not 0 < self.fps <= 1000:
-            raise DatasetError(f"{root / INFO_PATH}: fps is {self.fps}, expected a rate [Hz]")
+        if not MIN_HZ <= self.fps <= MAX_HZ:
+            raise DatasetError(f"{root / INFO_PATH}: fps is {self.fps}, expected a rate of {MIN_HZ} to {MAX_HZ} Hz")
         self.features: dict[str, dict[str, Any]] = self._field("features", dict)
         if strange := [name for name, feature in self.features.items() if not isinstance(feature, dict)]:
             raise DatasetError(f"{root / INFO_PATH}: features {strange} are described by no object")

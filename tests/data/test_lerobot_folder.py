@@ -266,6 +266,20 @@ def test_rows_that_are_not_the_listed_ones_are_refused(
         Dataset(folder).rows(0)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", ["observation.state", "action", "tcp_pose"])
+def test_a_number_that_is_not_finite_is_refused_with_episode_and_row(folder: Path, column: str, number: float) -> None:
+    table = pq.read_table(folder / DATA)
+    values = table[column].to_pylist()
+    values[LENGTHS[0] + 7][3] = number
+    column_of = pa.array(values, table.schema.field(column).type)
+    pq.write_table(table.set_column(table.column_names.index(column), column, column_of), folder / DATA)
+    dataset = Dataset(folder)
+    assert len(dataset.rows(0)) == LENGTHS[0]
+    with pytest.raises(DatasetError, match=rf"{folder}: episode 1: column .* has {number} in row 7, place 3"):
+        dataset.rows(1)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
