@@ -1,8 +1,8 @@
 """Episodes of any robot as they were recorded, in a LeRobotDataset v3 folder at the robot's own rate.
 
 Row k holds what was seen at tick k and what was then commanded. Nothing is resampled and nothing added: a tick without
-a picture repeats the last one, and says so (``is_rendered``). Not what `pp-train` reads; `pp-collect import` makes that
-of it, where the robot is the Panda.
+an observation or a picture repeats the last one, and says so (``is_rendered``). Not what `pp-train` reads;
+`pp-collect import` makes that of it, where the robot is the Panda.
 """
 
 # N rows, P numbers of the state, A of the command
