@@ -63,5 +63,5 @@ def _quantiles(tables: dict[str, Any], name: str) -> Quantiles:
 def _row(values: Any, where: str) -> tuple[float, ...]:
     is_row = isinstance(values, list) and all(isinstance(each, int | float) and is_finite(each) for each in values)
     if not is_row or len(values) < _NUM_DIMS or any(values[_NUM_DIMS:]):  # openpi may pad with zeros
-        raise ValueError(f"{where}: expected {_NUM_DIMS} numbers, came {str(values)[:80]}")
+        raise ValueError(f"{where}: expected {_NUM_DIMS} finite numbers, came {str(values)[:80]}")
     return tuple(map(float, values[:_NUM_DIMS]))
