@@ -29,6 +29,7 @@ from dual_system.data.lerobot_v3 import COLLECTION_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
 from dual_system.data.shove import SHOVES
 from dual_system.data.store import Store
+from dual_system.data.video import check_image_px
 from dual_system.data.workers import JobT, LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.seeds import FIRST_COLLECTION_SEED
@@ -141,8 +142,7 @@ class CollectOptions:
             raise DatasetError("--episodes and --workers must be at least 1")
         if self.first_episode < 0:
             raise DatasetError(f"--first-episode {self.first_episode}: episodes count from 0")
-        if self.pictures.image_px < 16 or self.pictures.image_px % 2:
-            raise DatasetError(f"--image-px {self.pictures.image_px}: videos need an even number of at least 16")
+        check_image_px(self.pictures.image_px)
         if not 0 <= self.content.recovery_share <= 1:
             raise DatasetError(f"--recovery-share {self.content.recovery_share} is not a share, in [0, 1]")
         if not 0 <= self.content.shove_share <= 1:

@@ -32,6 +32,7 @@ from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.lerobot_v3 import DatasetWriter
 from dual_system.data.recorded import logs_in
 from dual_system.data.rollout import Scribe, UnsolvedError, asked, check_solved, kept_environment
+from dual_system.data.video import check_image_px
 from dual_system.data.workers import LocalWorkers, Workers
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot
@@ -70,6 +71,7 @@ class CorrectOptions:
     def __post_init__(self) -> None:
         if self.per_episode < 1 or self.workers < 1:
             raise ValueError(f"per_episode and workers must be at least 1, came {self.per_episode} and {self.workers}")
+        check_image_px(self.image_px)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -79,7 +79,8 @@ class Dataset:
         """The rows of an episode.
 
         Raises:
-            DatasetError: the file is broken, or its rows are not those that ``meta/episodes`` lists.
+            DatasetError: the file is broken, its rows are not those that ``meta/episodes`` lists, or a number of a
+                row is not finite.
         """
         theirs = {ours: name for name, ours in v3.OUR_NAMES.items()}
         wanted = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in self._folder.features]

@@ -228,8 +228,8 @@ def from_table(table: pa.Table, sizes: Mapping[str, int] | None = None) -> Rows:
     ``sizes``: how many numbers a row of each column of vectors has; None: as many as `to_table` wrote.
 
     Raises:
-        ValueError: a column cannot be of its type in `Rows`, or a value is null. Other widths are cast: pandas, with
-            which LeRobot's tools rewrite rows, has its own.
+        ValueError: a column cannot be of its type in `Rows`, or a value is null or no finite number. Other widths are
+            cast: pandas, with which LeRobot's tools rewrite rows, has its own.
     """
     required = [each.name for each in fields(Rows) if each.name not in OPTIONAL]
     names = [*required, *(name for name in OPTIONAL if name in table.column_names)]
@@ -249,6 +249,14 @@ def _executed(rows: list[Row]) -> NDArray[np.float32] | None:
     if all(row.executed_action is None for row in rows):
         return None
     return np.stack([row.action if row.executed_action is None else row.executed_action for row in rows])
+
+
+def require_finite(what: str, values: NDArray[np.floating[Any]]) -> None:
+    """Raises ValueError that names the first row with a number that is NaN or infinite."""
+    if not np.isfinite(values).all():
+        row, *place = np.argwhere(~np.isfinite(values))[0].tolist()
+        at = f"row {row}, place {place[0]}" if place else f"row {row}"
+        raise ValueError(f"{what} has {values[row, *place]} in {at}; expected finite numbers")
 
 
 def _to_arrow(column: Any) -> Any:
@@ -273,5 +281,7 @@ def _from_arrow(name: str, column: Any, sizes: Mapping[str, int] | None) -> Any:
     if pa.types.is_string(kind):
         return tuple(column.to_pylist())
     if pa.types.is_nested(kind):
-        return column.flatten().to_numpy().reshape(len(column), kind.list_size)
+        values = column.flatten().to_numpy().reshape(len(column), kind.list_size)
+        require_finite(f"column {name}", values)
+        return values
     return column.to_numpy(zero_copy_only=False)

@@ -24,6 +24,7 @@ from dual_system.data.lerobot_v3 import DatasetWriter
 from dual_system.data.mapping import SourceMapping, read_mapping
 from dual_system.data.robomme_h5 import SUFFIXES, RobommeFile
 from dual_system.data.source import NO_PICTURE, LeRobotSource, SourceEpisode, at_20_hz, frame_at
+from dual_system.data.video import check_image_px
 from dual_system.models.arm import tool_poses
 from dual_system.tasks.geometry import pose_of
 from protocol import files
@@ -46,6 +47,9 @@ class ImportOptions:
     """Largest number of episodes of each source. None: all."""
     progress: bool = True
     """Do not show a progress bar."""
+
+    def __post_init__(self) -> None:
+        check_image_px(self.image_px)
 
 
 @command("pp-collect import")
@@ -75,7 +79,10 @@ def import_sets(options: ImportOptions) -> tuple[int, int]:
     num_episodes = num_silent = 0
     for path in options.sources:
         for source in _shown(path, mapping, options):
-            episode = as_ours(source, options.image_px)
+            try:
+                episode = as_ours(source, options.image_px)
+            except DatasetError as error:
+                raise DatasetError(f"{path}: {error}") from None
             with files.writing(options.out):
                 writer.add(episode)
             num_episodes += 1

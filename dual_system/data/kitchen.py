@@ -33,7 +33,7 @@ from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import ATTEMPTS
 from dual_system.data.paired import PANDA_OMRON, Instant, pack_pair, write_splits
 from dual_system.data.rollout import UNSOLVED
-from dual_system.data.video import FPS
+from dual_system.data.video import FPS, check_image_px
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.kitchen.catalogue import TASKS
 from dual_system.tasks.kitchen.environment import IMAGE_PX, KitchenEnvironment
@@ -88,8 +88,7 @@ class KitchenOptions:
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.machine.workers < 1:
             raise DatasetError("--episodes and --workers must be at least 1")
-        if self.image_px < 16 or self.image_px % 2:
-            raise DatasetError(f"--image-px {self.image_px}: videos need an even number of at least 16")
+        check_image_px(self.image_px)
 
     @property
     def robot(self) -> RobotColumns:

@@ -21,6 +21,8 @@ from dual_system.data.video import CODEC, PIXEL_FORMAT, VideoJoiner
 VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
 DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
+MIN_HZ, MAX_HZ = 0.01, 1000
+"""Rates of a folder's rows that are read."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH, TASKS_PATH = "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"
@@ -200,8 +202,9 @@ def tasks_table(instructions: Mapping[str, int]) -> pa.Table:
 
 
 def made(path: Path) -> Path:
+    """Makes a file's folder. Returns the path, absolute: pyarrow takes "run:1" at its beginning for a URI's scheme."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+    return path.absolute()
 
 
 def write_json(path: Path, values: Any) -> None:

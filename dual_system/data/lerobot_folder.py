@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dual_system.data.errors import DatasetError
-from dual_system.data.lerobot_files import DATA_PATH, INFO_PATH, VERSION, VIDEO_PATH
+from dual_system.data.lerobot_files import DATA_PATH, INFO_PATH, MAX_HZ, MIN_HZ, VERSION, VIDEO_PATH
 from dual_system.data.video import read_frames, read_header
 from dual_system.hub import local_folder
 from protocol.files import read_object, require_file
@@ -36,6 +36,7 @@ MAX_TEXT_BYTES = 500_000_000
 """Most text that is read at once: one episode's, or a file of meta/episodes."""
 _NUMBERING = ("index", "episode_index", "frame_index", "timestamp")
 _OLDER = "LeRobot converts older ones: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+_OTHER = "No way from this version is known here; lerobot 0.4.4 and 0.6.1 write the one that is read"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,10 +69,11 @@ class LeRobotFolder:
         with reading(root / INFO_PATH):
             self.info = read_object(root / INFO_PATH)
         if (version := self._field("codebase_version", str)) != VERSION:
-            raise DatasetError(f"{root} is a LeRobot dataset of version {version}, and {VERSION} is read. {_OLDER}")
+            way_out = _OLDER if version.startswith(("v1.", "v2.")) else _OTHER
+            raise DatasetError(f"{root} is a LeRobot dataset of version {version}, and {VERSION} is read. {way_out}")
         self.fps: float = self._field("fps", int, float)
-        if not 0 < self.fps <= 1000:
-            raise DatasetError(f"{root / INFO_PATH}: fps is {self.fps}, expected a rate [Hz]")
+        if not MIN_HZ <= self.fps <= MAX_HZ:
+            raise DatasetError(f"{root / INFO_PATH}: fps is {self.fps}, expected a rate of {MIN_HZ} to {MAX_HZ} Hz")
         self.features: dict[str, dict[str, Any]] = self._field("features", dict)
         if strange := [name for name, feature in self.features.items() if not isinstance(feature, dict)]:
             raise DatasetError(f"{root / INFO_PATH}: features {strange} are described by no object")
@@ -274,13 +276,13 @@ class _Footer:
 def _opened(path: Path) -> pq.ParquetFile:
     require_file(path)
     footer = _footer(path, path.stat().st_mtime_ns)
-    return pq.ParquetFile(path, metadata=footer.about, read_dictionary=footer.texts)
+    return pq.ParquetFile(path.absolute(), metadata=footer.about, read_dictionary=footer.texts)
 
 
 @lru_cache(maxsize=64)
 def _footer(path: Path, changed_ns: int) -> _Footer:
     """Raises ValueError if the file declares more than is read."""
-    about = pq.read_metadata(path)
+    about = pq.read_metadata(path.absolute())  # pyarrow takes "run:1" at the beginning of a path for a URI's scheme
     num_bytes = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
     if about.num_rows > MAX_FILE_ROWS or num_bytes > MAX_FILE_BYTES:
         raise ValueError(

@@ -117,7 +117,7 @@ class DatasetWriter:
         for videos in self._videos.values():
             videos.close()
         pq.write_table(pa.Table.from_pylist(self._episodes), layout.made(self._root / EPISODES_PATH))
-        pq.write_table(layout.tasks_table(self._instructions), self._root / TASKS_PATH)
+        pq.write_table(layout.tasks_table(self._instructions), layout.made(self._root / TASKS_PATH))
         statistics = self._data.statistics(_POLICY)
         statistics |= {video_key(camera): pixels.statistics() for camera, pixels in self._pixels.items()}
         layout.write_json(self._root / STATS_PATH, statistics)

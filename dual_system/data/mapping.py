@@ -13,7 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.data.episode import require_finite
 from dual_system.data.errors import DatasetError
+from dual_system.data.lerobot_files import MAX_HZ, MIN_HZ
 from dual_system.models.config_json import from_json
 from protocol import files
 
@@ -45,9 +47,9 @@ class Arm:
     """The gripper's number when it is open."""
 
     def __post_init__(self) -> None:
-        if len(self.dims) not in (ROBOT_DIM - 1, ROBOT_DIM) or min(self.dims) < 0:
+        if not len(self.dims) == len({*self.dims}) in (ROBOT_DIM - 1, ROBOT_DIM) or min(self.dims) < 0:
             raise ValueError(
-                f"{self.column}: dims must be the places of seven joints and the gripper, came {self.dims}"
+                f"{self.column}: dims must be the places of seven joints and the gripper, each once, came {self.dims}"
             )
         if self.closed == self.opened:
             raise ValueError(f"{self.column}: closed and opened are both {self.closed}")
@@ -55,18 +57,19 @@ class Arm:
     def read(self, values_TD: NDArray[np.floating[Any]], ours: tuple[float, float]) -> NDArray[np.float32]:
         """(T, 8) of the column's (T, D), with the gripper scaled to ``ours`` (closed, open).
 
-        Raises DatasetError if the column is narrower, or has numbers that are not finite.
+        Raises ValueError if the column is narrower, or has numbers that are not finite or not when they are scaled.
         """
         if values_TD.ndim != 2 or values_TD.shape[1] <= max(self.dims):
-            raise DatasetError(f"column {self.column} has the shape {values_TD.shape[1:]}, and place {max(self.dims)}"
-                               " of it is to be read")  # fmt: skip
-        found = values_TD[:, list(self.dims)].astype(np.float32)
-        if not np.isfinite(found).all():
-            raise DatasetError(f"column {self.column} has numbers that are NaN or infinite")
-        if len(self.dims) < ROBOT_DIM:
-            return np.pad(found, ((0, 0), (0, 1)), constant_values=ours[0])
-        if (self.closed, self.opened) != ours:
-            found[:, -1] = ours[0] + (found[:, -1] - self.closed) / (self.opened - self.closed) * (ours[1] - ours[0])
+            raise ValueError(f"column {self.column} has the shape {values_TD.shape[1:]}, and place {max(self.dims)}"
+                             " of it is to be read")  # fmt: skip
+        closed, opened = self.closed, self.opened
+        with np.errstate(all="ignore"):  # what overflows is refused below
+            found = values_TD[:, list(self.dims)].astype(np.float32)
+            if len(self.dims) < ROBOT_DIM:
+                found = np.pad(found, ((0, 0), (0, 1)), constant_values=ours[0])
+            elif (closed, opened) != ours:
+                found[:, -1] = ours[0] + (found[:, -1] - closed) / (opened - closed) * (ours[1] - ours[0])
+        require_finite(f"column {self.column} (gripper from closed = {closed:g}, opened = {opened:g})", found)
         return found
 
 
@@ -91,6 +94,10 @@ class SourceMapping:
     """Subgoal that means none; the one before it stays in force."""
     task: str = ""
     """Name of the task in all episodes; "": the name of the folder."""
+
+    def __post_init__(self) -> None:
+        if self.rows_hz is not None and not MIN_HZ <= self.rows_hz <= MAX_HZ:
+            raise ValueError(f"rows_hz: expected a rate of {MIN_HZ} to {MAX_HZ} Hz, came {self.rows_hz}")
 
     def columns(self) -> tuple[str, ...]:
         """Columns to read, each once."""

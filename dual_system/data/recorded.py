@@ -45,13 +45,13 @@ def why_unfit(path: Path, record: EpisodeRecord) -> str:
 
 
 def recording_of(path: Path, record: EpisodeRecord) -> Recording:
-    """Joins a log's messages.
+    """Joins a log's messages. A tick without an observation, for which the robot was late, has the newest before it.
 
     Raises:
-        DatasetError: an observation or a tick is missing.
+        DatasetError: the account of a tick is missing, or an observation of the first or of more than half a second.
     """
     info = record.info
-    observations, ticks = joined(path, record)
+    observations, ticks = joined(path, record, most_held_ticks=info.schedule.control_hz // 2)
     spoken, writer = _spoken(record, ticks)
     return Recording(
         name=str(path),
@@ -76,21 +76,34 @@ def recording_of(path: Path, record: EpisodeRecord) -> Recording:
     )
 
 
-def joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], list[m.Tick]]:
+def joined(path: Path, record: EpisodeRecord, *, most_held_ticks: int = 0) -> tuple[list[m.Observation], list[m.Tick]]:
     """Returns observations and ticks 0, 1, 2 ...; the observation after the last tick is left out.
 
-    Raises DatasetError if one is missing.
+    A tick without an observation has the newest one before it, which may be ``most_held_ticks`` old.
+
+    Raises DatasetError if the account of a tick or such an observation is missing.
     """
     seen = {each.tick: each for each in record.observations}
     done = {each.tick: each for each in record.ticks}
     num_ticks = record.result.num_ticks if record.result else len(done)
-    missing = [tick for tick in range(num_ticks) if tick not in seen or tick not in done]
-    if missing or not num_ticks:
-        what = f"ticks {missing[:5]} of {num_ticks}" if missing else "every tick"
-        raise DatasetError(
-            f"{path}: the log lacks the observation or the account of {what}: an episode with gaps cannot be trained on"
-        )
-    return [seen[tick] for tick in range(num_ticks)], [done[tick] for tick in range(num_ticks)]
+    if not num_ticks:
+        raise DatasetError(f"{path}: the log has no tick")
+    last, shown = -1 - most_held_ticks, []
+    for tick in range(num_ticks):
+        last = tick if tick in seen else last
+        shown.append(last)
+    unseen = [tick for tick, newest in enumerate(shown) if tick - newest > most_held_ticks]
+    older = f", and any in the {most_held_ticks} ticks before," if most_held_ticks else ""
+    for what, missing in (
+        ("account", [tick for tick in range(num_ticks) if tick not in done]),
+        (f"observation{older}", unseen),
+    ):
+        if missing:
+            raise DatasetError(
+                f"{path}: the log lacks the {what} of ticks {missing[:5]} of {num_ticks}: an episode with such gaps "
+                "cannot be trained on"
+            )
+    return [seen[newest] for newest in shown], [done[tick] for tick in range(num_ticks)]
 
 
 def commands(robot: m.Robot, ticks: Sequence[m.Tick]) -> list[m.Floats]:
@@ -126,7 +139,7 @@ def _spoken(record: EpisodeRecord, ticks: Sequence[m.Tick]) -> tuple[list[dict[s
 def _seen(path: Path, robot: m.Robot, observations: Sequence[m.Observation]) -> Iterator[Seen]:
     """Every picture: the exact pixels where the log has them, else what its cameras' channels hold."""
     elsewhere = {}
-    for each in observations:
+    for each in dict.fromkeys(observations):  # one that was held is shown once
         for image in each.images:
             if image.codec == m.ImageCodec.RAW:
                 yield Seen(image.camera, each.tick, images.unpack(image))

@@ -1,8 +1,8 @@
 """Episodes of any robot as they were recorded, in a LeRobotDataset v3 folder at the robot's own rate.
 
 Row k holds what was seen at tick k and what was then commanded. Nothing is resampled and nothing added: a tick without
-a picture repeats the last one, and says so (``is_rendered``). Not what `pp-train` reads; `pp-collect import` makes that
-of it, where the robot is the Panda.
+an observation or a picture repeats the last one, and says so (``is_rendered``). Not what `pp-train` reads;
+`pp-collect import` makes that of it, where the robot is the Panda.
 """
 
 # N rows, P numbers of the state, A of the command
@@ -122,7 +122,7 @@ class RecordingWriter:
         for videos in self._videos.values():
             videos.close()
         pq.write_table(pa.Table.from_pylist(self._episodes), layout.made(self._root / layout.EPISODES_PATH))
-        pq.write_table(layout.tasks_table(self._instructions), self._root / layout.TASKS_PATH)
+        pq.write_table(layout.tasks_table(self._instructions), layout.made(self._root / layout.TASKS_PATH))
         statistics = self._data.statistics()
         statistics |= {layout.video_key(camera): pixels.statistics() for camera, pixels in self._pixels.items()}
         layout.write_json(self._root / layout.STATS_PATH, statistics)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.data.episode import require_finite
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_folder import reading
 from dual_system.data.mapping import GRIPPER, ROBOMME, ROBOT_DIM
@@ -65,6 +66,10 @@ class RobommeFile:
         joints = np.stack([_vector(step["obs/joint_state"])[: ROBOT_DIM - 1] for step in steps])
         fingers = np.array([_vector(step["obs/gripper_state"])[:1] for step in steps])
         commands = [_vector(step["action/joint_action"]) for step in steps]
+        state_T8 = np.concatenate([joints, fingers], axis=1).astype(np.float32)
+        action_T8 = np.stack([_with_gripper(command) for command in commands])
+        for name, values in (("obs/joint_state or gripper_state", state_T8), ("action/joint_action", action_T8)):
+            require_finite(f"{self._path}: episode {number}: {name}", values)
         setup, task = group["setup"], self._path.stem.rpartition("_")[2]
         texts = {
             name: in_force([_text(step["info"][name]) for step in steps], ROBOMME.done_text)
@@ -81,8 +86,8 @@ class RobommeFile:
             number=int(np.ravel(setup["seed"][()])[0]),
             difficulty=_text(setup["difficulty"]),
             rows_hz=FPS,
-            state_T8=np.concatenate([joints, fingers], axis=1).astype(np.float32),
-            action_T8=np.stack([_with_gripper(command) for command in commands]),
+            state_T8=state_T8,
+            action_T8=action_T8,
             subgoal=texts["simple_subgoal"],
             grounded_subgoal=texts["grounded_subgoal"],
             is_demonstration_T=np.array([bool(np.ravel(step["info/is_video_demo"][()])[0]) for step in steps]),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dual_system.data.episode import CAMERAS
+from dual_system.data.episode import CAMERAS, require_finite
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_folder import LeRobotFolder
 from dual_system.data.mapping import FINGER_M, GRIPPER, SourceMapping
@@ -160,16 +160,18 @@ class LeRobotSource:
         try:
             state_T8 = mapping.state.read(_numbers(table, mapping.state.column), FINGER_M)
             action_T8 = mapping.action.read(_numbers(table, mapping.action.column), GRIPPER)
-        except DatasetError as error:
+            is_demonstration_T = np.zeros(len(state_T8), np.bool_)
+            if mapping.demonstration:
+                flags_T = _numbers(table, mapping.demonstration).reshape(-1)
+                require_finite(f"column {mapping.demonstration}", flags_T)
+                is_demonstration_T = flags_T.astype(np.bool_)
+        except ValueError as error:
             raise DatasetError(f"{self._root}: episode {number}: {error}") from None
         if mapping.action_kind == "delta":
             action_T8[:, :-1] += state_T8[:, :-1]
         tasks = listed.get("tasks")
         if not isinstance(tasks, list) or not tasks or not isinstance(tasks[0], str):
             raise DatasetError(f"{self._root}: meta/episodes: expected tasks of episode {number}, came {tasks!r}")
-        is_demonstration_T = np.zeros(len(state_T8), np.bool_)
-        if mapping.demonstration:
-            is_demonstration_T = _numbers(table, mapping.demonstration).reshape(-1).astype(np.bool_)
         episode = SourceEpisode(
             task=mapping.task or self._root.name,
             instruction=tasks[0],
@@ -191,11 +193,11 @@ class LeRobotSource:
 
 
 def _numbers(table: Any, column: str) -> NDArray[Any]:
-    """(T, D) of a column of lists, (T,) of one of numbers."""
+    """(T, D) of a column of lists, (T,) of one of numbers. Raises ValueError if it is of something else."""
     try:
         return np.asarray(table[column].to_pylist(), np.float64)
     except (TypeError, ValueError):
-        raise DatasetError(f"column {column} has the type {table[column].type}, expected numbers") from None
+        raise ValueError(f"column {column} has the type {table[column].type}, expected numbers") from None
 
 
 def frame_at(frames: Frames, rows: Sequence[int]) -> Iterator[dict[str, Frame]]:

@@ -18,6 +18,8 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.data.errors import DatasetError
+
 FPS = 20
 CODEC, PIXEL_FORMAT = "h264", "yuv420p"
 FRAMES_PER_KEY = 10
@@ -31,6 +33,12 @@ _OPTIONS = {
 }
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
+
+
+def check_image_px(image_px: int) -> None:
+    """Raises DatasetError unless videos can have square pictures of this side, which is an option's value."""
+    if image_px < 16 or image_px % 2:
+        raise DatasetError(f"--image-px {image_px}: videos need an even number of at least 16")
 
 
 class VideoWriter:
@@ -77,7 +85,7 @@ class VideoJoiner:
     def __init__(self, path: Path, fps: int = FPS) -> None:
         self._time_base = Fraction(1, fps)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(path), "w", format="mp4")
+        self._container = av.open(_url(path), "w", format="mp4")
         self._stream: Any = None
         self.num_frames = 0
         self.num_bytes = 0  # of what was appended
@@ -157,11 +165,16 @@ def read_frames(path: Path, indices: Sequence[int], *, fps: float = FPS) -> Iter
             yield frame.to_ndarray(format="rgb24")
 
 
+def _url(path: Path) -> str:
+    """The name under which FFmpeg opens a file: it takes "run:1" at the beginning of a path for a protocol."""
+    return str(path.absolute())
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A video's container and stream; FFmpeg's errors, also those of decoding, become ValueErrors that name it."""
     try:
-        with av.open(str(path), "r") as container:
+        with av.open(_url(path), "r") as container:
             if not container.streams.video:
                 raise ValueError(f"{path} has no video stream")
             yield container, container.streams.video[0]

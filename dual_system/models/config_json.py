@@ -5,6 +5,7 @@ Writing needs no code: `dataclasses.asdict` and `json.dumps`.
 """
 
 import dataclasses
+import sys
 import types
 import typing
 from typing import Any, TypeVar
@@ -19,8 +20,8 @@ def from_json(kind: type[Record], values: Any, where: str) -> Record:
     records.
 
     Raises:
-        ValueError: a field without a default is missing, a name is unknown, a value has another type, or the record's
-            own checks refuse it.
+        ValueError: a field without a default is missing, a name is unknown, a value has another type or is no finite
+            number, or the record's own checks refuse it.
     """
     if not dataclasses.is_dataclass(kind):
         raise TypeError(f"{kind} is no dataclass")
@@ -47,6 +48,11 @@ def deviations(record: Any) -> dict[str, Any]:
     return found
 
 
+def is_finite(number: int | float) -> bool:
+    """Whether a number is one that a float holds: JSON and TOML also have NaN, infinity and integers beyond floats."""
+    return abs(number) <= sys.float_info.max
+
+
 def _value(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_json(typing.cast(type[Any], hint), value, where)
@@ -62,6 +68,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     if not _fits(hint, value):
         expected = " or ".join(map(repr, args)) if origin is typing.Literal else getattr(hint, "__name__", hint)
         raise ValueError(f"{where}: expected {expected}, came {value!r}")
+    if isinstance(value, int | float) and not is_finite(value):
+        raise ValueError(f"{where}: expected a finite number, came {value!r:.40}")
     return value
 
 

@@ -4,10 +4,10 @@ openpi's ``norm_stats.json`` has quantiles of one robot and is read. lerobot's p
 other normalisations, of action spaces that they do not name: refused, because other statistics are another policy.
 """
 
-import math
 from pathlib import Path
 from typing import Any
 
+from dual_system.models.config_json import is_finite
 from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
 from protocol.files import read_object
 
@@ -61,7 +61,7 @@ def _quantiles(tables: dict[str, Any], name: str) -> Quantiles:
 
 
 def _row(values: Any, where: str) -> tuple[float, ...]:
-    is_row = isinstance(values, list) and all(isinstance(each, int | float) and math.isfinite(each) for each in values)
+    is_row = isinstance(values, list) and all(isinstance(each, int | float) and is_finite(each) for each in values)
     if not is_row or len(values) < _NUM_DIMS or any(values[_NUM_DIMS:]):  # openpi may pad with zeros
-        raise ValueError(f"{where}: expected {_NUM_DIMS} numbers, came {str(values)[:80]}")
+        raise ValueError(f"{where}: expected {_NUM_DIMS} finite numbers, came {str(values)[:80]}")
     return tuple(map(float, values[:_NUM_DIMS]))

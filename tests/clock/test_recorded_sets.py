@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from dual_system.data.errors import DatasetError
 from dual_system.data.export import ExportOptions, export, main
 from dual_system.data.lerobot_folder import LeRobotFolder
-from dual_system.data.recorded import recording_of
+from dual_system.data.recorded import joined, recording_of
 from dual_system.data.recording import RecordingWriter
 from protocol import images
 from protocol import messages as m
@@ -50,6 +52,11 @@ def played(lockstep: Callable[..., Any], timing: Callable[..., m.Schedule]) -> C
         return episode
 
     return play
+
+
+@pytest.fixture(scope="module")
+def record(played: Any, tmp_path_factory: pytest.TempPathFactory) -> EpisodeRecord:
+    return read_log(played("six_axes").save(tmp_path_factory.mktemp("log") / "a.mcap"))
 
 
 def saved(episode: Any, path: Path, **options: Any) -> tuple[Path, EpisodeRecord]:
@@ -129,9 +136,11 @@ def test_cut_holed_and_false_logs_are_named_with_the_reason(
     tick, wall_ns = episode.said[at]
     moved = (replace(tick, action=tick.action + 1), wall_ns)
     replace(episode, said=[*episode.said[:at], moved, *episode.said[at + 1 :]]).save(false)
-    seen = [pair for pair in episode.said if not (isinstance(pair[0], m.Observation) and pair[0].tick == 21)]
+    silent = range(20, 21 + episode.info.robot.control_hz // 2)  # longer than half a second
+    seen = [pair for pair in episode.said if not (isinstance(pair[0], m.Observation) and pair[0].tick in silent)]
     replace(episode, said=seen).save(holed)
-    for log, why in ((cut, "cut"), (false, r"does not agree .* Tick 20"), (holed, r"")):
+    lacks = rf"lacks the observation, and any in the {silent[-1] - 20} ticks before, of ticks \[{silent[-1]}\] of 40"
+    for log, why in ((cut, "cut"), (false, r"does not agree .* Tick 20"), (holed, lacks)):
         with pytest.raises(DatasetError, match=rf"{log.name}: .*{why}"):
             export(ExportOptions(files=(fine, log), out=tmp_path / f"{log.stem}-set", progress=False))
     logs = [str(each) for each in (cut, fine, false, holed)]
@@ -156,6 +165,43 @@ def test_a_missed_tick_repeats_the_command_and_a_missing_picture_the_picture(pla
     assert [row for row, own in enumerate(table["is_rendered"].to_pylist()) if not own] == [9]
     shown = folder.frames(0, "observation.images.front", [8, 9, 10]).astype(float)
     assert np.abs(shown[1] - shown[0]).mean() < 1 < np.abs(shown[2] - shown[0]).mean()
+
+
+@given(unseen=st.sets(st.integers(0, 39)) | st.sampled_from([set(range(9, 19)), set(range(9, 20))]), most=st.just(10))
+@example(unseen={12, 15, 39}, most=10)
+@example(unseen={1}, most=0)
+def test_a_tick_that_was_not_observed_has_the_newest_observation_before_it_or_the_log_is_refused(
+    record: EpisodeRecord, unseen: set[int], most: int
+) -> None:
+    holed = replace(record, observations=[each for each in record.observations if each.tick not in unseen])
+    newest = [max((each for each in range(tick + 1) if each not in unseen), default=None) for tick in range(40)]
+    if all(of is not None and tick - of <= most for tick, of in enumerate(newest)):
+        observations, ticks = joined(Path("a.mcap"), holed, most_held_ticks=most)
+        assert [each.tick for each in observations] == newest
+        assert [each.tick for each in ticks] == list(range(40))
+    else:
+        with pytest.raises(DatasetError, match=r"a\.mcap: the log lacks the observation.* of ticks .* of 40"):
+            joined(Path("a.mcap"), holed, most_held_ticks=most)
+
+
+def test_a_tick_without_an_account_is_refused_by_that_name(record: EpisodeRecord) -> None:
+    holed = replace(record, ticks=[each for each in record.ticks if each.tick != 7])
+    with pytest.raises(DatasetError, match=r"lacks the account of ticks \[7\] of 40"):
+        joined(Path("a.mcap"), holed, most_held_ticks=10)
+
+
+def test_a_log_of_a_late_robot_has_rows_of_what_was_seen_before(played: Any, tmp_path: Path) -> None:
+    episode, late = played("six_axes"), (12, 15, 16)
+    kept = [pair for pair in episode.said if not (isinstance(pair[0], m.Observation) and pair[0].tick in late)]
+    log, record = saved(replace(episode, said=kept), tmp_path / "late.mcap")
+    assert export(ExportOptions(files=(log,), out=tmp_path / "set", progress=False)) == (1, [])
+    table = LeRobotFolder(tmp_path / "set").rows(0, COLUMNS)
+    state, action = (np.array(table[column].to_pylist(), np.float32) for column in COLUMNS[:2])
+    seen = {each.tick: each.proprio for each in record.observations}
+    newest = [{12: 11, 15: 14, 16: 14}.get(tick, tick) for tick in range(40)]
+    np.testing.assert_array_equal(state, [seen[tick] for tick in newest])
+    np.testing.assert_array_equal(action, [each.action for each in record.ticks])
+    assert [row for row, own in enumerate(table["is_rendered"].to_pylist()) if not own] == [*late]
 
 
 @pytest.mark.peers

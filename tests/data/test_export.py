@@ -137,10 +137,11 @@ def test_pictures_are_the_ones_of_their_ticks(exported: Dataset, record: Episode
             assert np.abs(picture.astype(float) - exact).mean() < 4  # what the codec takes
 
 
-def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord) -> None:
-    holed = dataclasses.replace(record, ticks=record.ticks[:7] + record.ticks[8:])
-    with pytest.raises(DatasetError, match=r"ticks \[7\]"):
-        read_episode(log, holed)
+@pytest.mark.parametrize(("field", "said"), [("ticks", "account"), ("observations", "observation")])
+def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord, field: str, said: str) -> None:
+    kept = [each for each in getattr(record, field) if each.tick != 7]
+    with pytest.raises(DatasetError, match=rf"lacks the {said} of ticks \[7\]"):
+        read_episode(log, dataclasses.replace(record, **{field: kept}))
 
 
 def test_a_log_of_another_scene_is_refused(log: Path, record: EpisodeRecord) -> None:

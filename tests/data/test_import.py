@@ -146,6 +146,22 @@ def test_none_keeps_the_subgoal_before_it() -> None:
     assert in_force(["a", ""], "") == ("a", "")
 
 
+@given(
+    closed=st.floats(allow_nan=False, allow_infinity=False),
+    opened=st.floats(allow_nan=False, allow_infinity=False),
+    value=st.floats(),
+)
+def test_a_row_is_finite_or_refused(closed: float, opened: float, value: float) -> None:
+    if closed == opened:
+        return
+    try:
+        found = Arm(column="c", closed=closed, opened=opened).read(np.full((2, 8), value), GRIPPER)
+    except ValueError as error:
+        assert "column c" in str(error)  # noqa: PT017 - either may happen
+    else:
+        assert np.isfinite(found).all()
+
+
 @given(closed=st.floats(-5, 5), opened=st.floats(-5, 5), at=st.floats(0, 1), ours=st.sampled_from([FINGER_M, GRIPPER]))
 def test_a_gripper_s_ends_are_ours(closed: float, opened: float, at: float, ours: tuple[float, float]) -> None:
     if abs(closed - opened) < 1e-3:
@@ -197,6 +213,9 @@ def test_a_dataset_is_not_written_over(folder: Path, mapping: Path) -> None:
         import_sets(ImportOptions(sources=(folder,), out=folder, mapping=mapping, progress=False))
 
 
+NO_NUMBERS = ("nan", "inf", "-inf", "1" + "0" * 400)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -205,6 +224,10 @@ def test_a_dataset_is_not_written_over(folder: Path, mapping: Path) -> None:
         (OURS + "colour = 3", "unknown"),
         (OURS.replace("opened = 0.04", "opened = 0.0"), "closed and opened are both"),
         (OURS.replace('column = "action",', 'column = "action", dims = [1, 2],'), "seven joints"),
+        (OURS.replace('column = "action",', 'column = "action", dims = [0, 1, 2, 3, 4, 5, 6, 6],'), "each once"),
+        *((OURS.replace("closed = 0.0", f"closed = {odd}"), "state.closed: expected a finite") for odd in NO_NUMBERS),
+        *((f"rows_hz = {odd}\n{OURS}", "rows_hz: expected a finite number") for odd in NO_NUMBERS),
+        *((f"rows_hz = {odd}\n{OURS}", "rows_hz: expected a rate") for odd in ("0", "-20", "1e-300", "1001")),
     ],
 )
 def test_a_mapping_that_does_not_fit_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
@@ -217,15 +240,26 @@ def test_a_mapping_that_does_not_fit_is_refused_by_name(tmp_path: Path, text: st
 
 @pytest.mark.parametrize(
     ("values", "said"),
-    [(np.full((2, 8), np.nan), "NaN"), (np.zeros((2, 5)), "place 7 of it"), (np.zeros(2), "place 7 of it")],
+    [
+        (np.full((2, 8), np.nan), "state .* has nan in row 0"),
+        (np.zeros((2, 5)), "place 7 of it"),
+        (np.zeros(2), "place 7 of it"),
+    ],
 )
 def test_a_column_that_does_not_fit_is_told(values: Any, said: str) -> None:
-    with pytest.raises(DatasetError, match=said):
+    with pytest.raises(ValueError, match=said):
         ROBOMME.state.read(values, FINGER_M)
 
 
-def test_robomme_s_own_file(tmp_path: Path) -> None:
-    """As its recorder writes it: an action, and what was seen after it."""
+@pytest.mark.parametrize("image_px", [63, 14, 0, -2])
+def test_pictures_of_a_side_that_no_video_has_are_refused(image_px: int) -> None:
+    with pytest.raises(DatasetError, match=rf"--image-px {image_px}: videos need an even number of at least 16"):
+        ImportOptions(sources=(), out=Path("out"), image_px=image_px)
+
+
+@pytest.fixture
+def robomme_file(tmp_path: Path) -> Path:
+    """As RoboMME's recorder writes it: an action, and what was seen after it."""
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "record_dataset_VideoUnmask.h5"
     with h5py.File(path, "w") as file:
@@ -235,13 +269,27 @@ def test_robomme_s_own_file(tmp_path: Path) -> None:
             at = file.create_group(f"episode_4/timestep_{step}")
             for camera in ("front_rgb", "wrist_rgb"):
                 at[f"obs/{camera}"] = np.full((16, 16, 3), 10 * step, np.uint8)
-            at["obs/joint_state"], at["obs/gripper_state"] = np.full(7, step), np.full(2, 0.04)
+            at["obs/joint_state"], at["obs/gripper_state"] = np.full(7, 1.0 * step), np.full(2, 0.04)
             at["action/joint_action"] = np.full(8, 100.0 + step)
             at["info/is_video_demo"] = step < 5
             at["info/simple_subgoal"] = "pick it" if step < 11 else "task complete"
             at["info/grounded_subgoal"] = "pick it at <3, 4>"
+    return path
+
+
+@pytest.mark.parametrize("column", ["obs/joint_state", "obs/gripper_state", "action/joint_action"])
+def test_a_number_of_robomme_s_file_that_is_not_finite_is_told(robomme_file: Path, column: str) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(robomme_file, "r+") as file:
+        file[f"episode_4/timestep_3/{column}"][0] = np.nan
+    options = ImportOptions(sources=(robomme_file,), out=robomme_file.parent / "out", image_px=16, progress=False)
+    with pytest.raises(DatasetError, match=rf"Unmask\.h5: episode 4: .*{column.partition('/')[2]}.* has nan in row 3"):
+        import_sets(options)
+
+
+def test_robomme_s_own_file(robomme_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert import_sets(ImportOptions(sources=(path,), out=out, image_px=16, progress=False)) == (1, 0)
+    assert import_sets(ImportOptions(sources=(robomme_file,), out=out, image_px=16, progress=False)) == (1, 0)
     data = Dataset(out)
     (entry,) = data.episodes
     assert (entry.task, entry.seed, entry.difficulty) == ("VideoUnmask", 6007, "hard")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from dual_system.data import card
 from dual_system.data import lerobot_files as layout
 from dual_system.data import lerobot_v3 as v3
 from dual_system.data.dataset import Dataset
-from dual_system.data.episode import Package, unpack
+from dual_system.data.episode import Episode, Package, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.video import read_frames
 
@@ -29,13 +33,21 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 7\n"
 
 
 @pytest.fixture(scope="module")
-def base(package: Callable[..., Package], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("base")
+def episodes(package: Callable[..., Package]) -> list[Episode]:
+    return [unpack(package(seed, num_rows=length)) for seed, length in enumerate(LENGTHS)]
+
+
+def write(root: Path, episodes: list[Episode]) -> Path:
     writer = v3.DatasetWriter(root)
-    for seed, length in enumerate(LENGTHS):
-        writer.add(unpack(package(seed, num_rows=length)))
+    for episode in episodes:
+        writer.add(episode)
     writer.finish()
     return root
+
+
+@pytest.fixture(scope="module")
+def base(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("base"), episodes)
 
 
 @pytest.fixture
@@ -76,6 +88,26 @@ def edit_episodes(folder: Path, edit: Callable[[list[dict[str, Any]]], Any]) -> 
     pq.write_table(
         pa.Table.from_pylist(rows, schema=pq.read_schema(folder / layout.EPISODES_PATH)), folder / layout.EPISODES_PATH
     )
+
+
+# -- names
+
+
+@given(name=st.text("a1:#%? ü[]{}&=+", min_size=1, max_size=12))
+@example(name="run:1")
+@example(name="2026-11-30T10:20")
+@settings(max_examples=4)
+def test_a_relative_folder_of_any_name_is_written_and_read_as_a_plain_one(
+    base: Path, episodes: list[Episode], name: str
+) -> None:
+    with tempfile.TemporaryDirectory() as around, chdir(around):
+        write(Path(name), episodes)
+        written, expected = (
+            {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+            for root in (Path(name), base)
+        )
+        assert written == expected
+        assert_own_rows_and_frames(Path(name), base)
 
 
 # -- layouts that are right
@@ -234,10 +266,25 @@ def test_rows_that_are_not_the_listed_ones_are_refused(
         Dataset(folder).rows(0)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", ["observation.state", "action", "tcp_pose"])
+def test_a_number_that_is_not_finite_is_refused_with_episode_and_row(folder: Path, column: str, number: float) -> None:
+    table = pq.read_table(folder / DATA)
+    values = table[column].to_pylist()
+    values[LENGTHS[0] + 7][3] = number
+    column_of = pa.array(values, table.schema.field(column).type)
+    pq.write_table(table.set_column(table.column_names.index(column), column, column_of), folder / DATA)
+    dataset = Dataset(folder)
+    assert len(dataset.rows(0)) == LENGTHS[0]
+    with pytest.raises(DatasetError, match=rf"{folder}: episode 1: column .* has {number} in row 7, place 3"):
+        dataset.rows(1)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"codebase_version": "v2.1"}, r"version v2\.1, and v3\.0 is read\. LeRobot converts"),
+        *(({"codebase_version": each}, rf"{each}, and v3\.0 is read\. No way") for each in ("v3.1", "v4.0", "3.0", "")),
         ({"codebase_version": None}, "expected 'codebase_version' of type str, came nothing"),
         ({"features": None}, "expected 'features' of type dict"),
         ({"features": {}}, "no camera's videos; expected features"),

@@ -117,6 +117,12 @@ def test_a_missing_field_without_a_default_is_named(needed: str) -> None:
         ({"box": [0, "1"]}, r"^here\.box\[1\]: expected float, came '1'"),
         ({"box": 1}, r"^here\.box: expected .*, came 1"),
         ({"limit": []}, r"^here\.limit: expected .*, came \[\]"),
+        ({"limit": float("nan")}, r"^here\.limit: expected a finite number, came nan"),
+        ({"box": [0, float("-inf")]}, r"^here\.box\[1\]: expected a finite number, came -inf"),
+        (
+            {"others": [{"width": 1, "rate": 10**400}]},
+            r"^here\.others\[0\]\.rate: expected a finite number, came 100",
+        ),
         ({"speaks": 1}, r"^here\.speaks: expected bool, came 1"),
         ({"text": 1}, r"^here\.text: expected str, came 1"),
     ],

@@ -54,10 +54,11 @@ def test_padding_is_cut_off(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (tables(14), r"state\.q01: expected 8 numbers, came \[-9"),
-        (tables(7), r"state\.q01: expected 8 numbers"),
-        (tables(state={"mean": [0], "std": [1]}), r"state\.q01: expected 8 numbers, came None"),
-        (tables(actions={"q01": [float("nan")] * 8, "q99": [1] * 8}), r"actions\.q01: expected 8 numbers"),
+        (tables(14), r"state\.q01: expected 8 finite numbers, came \[-9"),
+        (tables(7), r"state\.q01: expected 8 finite numbers"),
+        (tables(state={"mean": [0], "std": [1]}), r"state\.q01: expected 8 finite numbers, came None"),
+        (tables(actions={"q01": [float("nan")] * 8, "q99": [1] * 8}), r"actions\.q01: expected 8 finite numbers"),
+        (tables(actions={"q01": [0] * 8, "q99": [10**400] * 8}), r"actions\.q99: expected 8 finite numbers, came"),
         (tables(actions={"q01": [2] * 8, "q99": [1] * 8}), "exceeds q99"),
         (tables(actions=None), r"actions\.q01: expected"),
         ({"norm_stats": 3}, "expected norm_stats to be an object"),

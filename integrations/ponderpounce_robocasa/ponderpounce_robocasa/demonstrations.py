@@ -58,7 +58,7 @@ def frames_of(path: Path) -> list[np.ndarray]:
     except ImportError:
         found = _by_opencv(path)
     else:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:  # FFmpeg takes "run:1" at its beginning for a protocol
             found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     if not found:
         raise DemonstrationError(f"{path}: no frame can be read")
