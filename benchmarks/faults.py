@@ -28,7 +28,7 @@ from benchmarks.blows import KINDS, MOMENTS, SERVERS, Fault, Place, Scene, draw,
 from benchmarks.fault_judge import tracebacks, unbidden_in, verdict
 from benchmarks.report import Report, Row, show
 from benchmarks.rig import Rig
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 
 _OWN_NAMESPACE = "PONDERPOUNCE_FAULTS_HAS_ITS_OWN_MOUNTS"
 _FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1")
@@ -52,7 +52,7 @@ class FaultsOptions:
     """No new trial is started after this time."""
     keep: Path = Path("out/faults")
     """Folder for what belongs to a wrong outcome."""
-    report: bool = True
+    report: On = True
     """Do not write the report."""
 
 

@@ -33,7 +33,7 @@ from clock.check_gaps import before_gaps
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.bus import LocalBus
-from protocol.command_line import parse
+from protocol.command_line import On, parse
 from protocol.drops import DropReason
 from protocol.errors import CallFailed
 from protocol.link import Link
@@ -64,7 +64,7 @@ class FuzzOptions:
     """In lockstep: mutated messages between two ticks."""
     burst: int = 40
     """In real time: mutated messages at a time; between two bursts everybody gets a millisecond."""
-    report: bool = True
+    report: On = True
     """Do not write the report."""
 
 

@@ -28,7 +28,7 @@ from typing import Any
 import yaml
 
 from benchmarks.report import Report, Row, show
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 from protocol.errors import CommandError
 
 ROOT = Path(__file__).parents[1]
@@ -52,7 +52,7 @@ class ImagesOptions:
     """Options of sim-client beside those of compose.yaml."""
     keep: bool = False
     """Do not remove the images."""
-    report: bool = True
+    report: On = True
     """Do not write the report."""
 
 

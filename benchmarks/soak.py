@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.report import Report, Row, show, spread
 from benchmarks.rig import Rig
 from clock.check import disagreements
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 from protocol.errors import FileError
 from protocol.mcap_log import EpisodeRecord, read_log
 from sim_client.config import ModeName
@@ -49,7 +49,7 @@ class SoakOptions:
     task: str = "PickHighlight"
     beside: str = "nothing"
     """What else ran on the machine; it is in the report."""
-    report: bool = True
+    report: On = True
     """Do not write the report."""
 
 

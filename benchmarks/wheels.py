@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.report import Report, Row, show
-from protocol.command_line import REFUSED, parse
+from protocol.command_line import REFUSED, On, parse
 from sim_client.launch import free_ports
 
 ROOT = Path(__file__).parents[1]
@@ -104,7 +104,7 @@ class WheelsOptions:
 
     only: tuple[str, ...] = ()
     """Names of cases, such as `[serve,sim]`, or `no extra`. Empty: all."""
-    report: bool = True
+    report: On = True
     """Do not write the report."""
 
 

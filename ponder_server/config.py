@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from ponder_server.contract import PolicyName, WeightsName
+from protocol.command_line import On
 from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 
@@ -52,9 +53,9 @@ class SpeedOptions:
     weights: WeightsName = "float"
     """Precision of the layers' weights. int8 (CPU) and fp8 (CPU or CUDA GPU) take one byte each; the change of
     cognition is measured at start and logged. fp8 products need a GPU of compute capability 8.9 or more."""
-    graphs: bool = True
+    graphs: On = True
     """Do not record forwards as CUDA graphs at start, on a GPU."""
-    kernels: bool = True
+    kernels: On = True
     """Do not try Triton kernels in them; each is taken only where it is right and faster."""
     attention_threads: int = 1
     """Threads for long-context attention on a CPU; at most the number of usable cores. The answers stay the same. 1

@@ -1,6 +1,6 @@
 """Commands: options as frozen dataclasses, with docstrings as ``--help``; and one sentence for what a person can mend.
 
-A switch that is off by default has ``--x``; one that is on has only ``--no-x``, so its docstring says "Do not ...".
+A switch that is off by default has ``--x``; one that is on (`On`) has only ``--no-x``: its docstring says "Do not ...".
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
@@ -30,6 +30,8 @@ from protocol.options import LinkOptions
 
 Options = TypeVar("Options")
 Main = Callable[..., int]
+On = Annotated[bool, tyro.conf.arg(help_behavior_hint="(default: not given)")]
+"""A switch that is on by default. Only its ``--no-x`` is shown, of which "(default: True)" would tell the opposite."""
 
 _GONE = frozenset({"--link.no-shared-memory"})
 """Options that scripts may still name, and that ask for what is done anyway."""

@@ -15,7 +15,7 @@ from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.recording import RecordingWriter
 from dual_system.data.rosbag import read_bag_mapping, recording_of_bag
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 from protocol.errors import FileError
 from sim_client.robot_file import read_robot
 
@@ -34,7 +34,7 @@ class BagOptions:
     """Folder of the new dataset."""
     unfit: Literal["refuse", "leave-out"] = "refuse"
     """A bag with a gap, without a topic or cut. refuse: stop and name it; leave-out: go on without it and say why."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -10,7 +10,7 @@ import tyro
 
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.seeds import scenes, split_of
-from protocol.command_line import flat
+from protocol.command_line import On, flat
 from protocol.errors import CommandError
 from protocol.options import LinkOptions
 from sim_client import config
@@ -78,7 +78,7 @@ class LogOptions:
     """Write one MCAP per episode, about 10 MB a minute."""
     record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
     """Rate of logged pictures in Hz, with --record; those that the models observe are logged as well."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

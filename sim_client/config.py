@@ -12,6 +12,7 @@ from clock import schedules
 from clock.policies import SERVERS, PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from dual_system.tasks.difficulty import Difficulty
+from protocol.command_line import On
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
@@ -120,13 +121,13 @@ class ModelsOptions:
 class LogOptions:
     """Logs and progress."""
 
-    record: bool = True
+    record: On = True
     """Do not write an MCAP per episode."""
     record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
     """Rate of logged pictures in Hz in lockstep; those that the models observe are logged as well."""
     pixels: Literal["jpeg", "exact"] = "jpeg"
     """Form of logged raw frames. jpeg: as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -33,7 +33,7 @@ from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.pair_files import demo_sampling_of, read_pairs
 from dual_system.tasks.pairs import Pair, Telling
 from protocol import files
-from protocol.command_line import command, flat, parse
+from protocol.command_line import On, command, flat, parse
 from sim_client.config import ModelsOptions
 from sim_client.ledger import write_json
 from sim_client.panda_robot import CAMERAS
@@ -66,7 +66,7 @@ class CounterfactualOptions:
     age_ms: int = 300
     """Age of the present's cognition in ms, given to POUNCE; in an episode it is PONDER's delay (paper: 300)."""
     models: tyro.conf.OmitArgPrefixes[ModelsOptions] = field(default_factory=ModelsOptions)
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

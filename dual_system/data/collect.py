@@ -35,7 +35,7 @@ from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.seeds import FIRST_COLLECTION_SEED
 from dual_system.tasks.task import chosen_tasks
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 from protocol.version import DISTRIBUTION
 
 SCALES = {"1x": 1, "9x": 9}
@@ -94,7 +94,7 @@ class MachineOptions:
     """Address of a Ray cluster to work on instead, or `auto`, or `local`."""
     keep_episodes: bool = False
     """Keep OUT/.collecting, so that more --episodes can be added to the same folder."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -40,7 +40,7 @@ from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.oracle import Motions
 from dual_system.tasks.seeds import UNTRAINED
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 from protocol.mcap_log import EpisodeRecord, read_log
 
 DONE, REFUSED = 0, 2
@@ -65,7 +65,7 @@ class CorrectOptions:
     """Limit of control steps per episode; longer episodes are not kept."""
     workers: int = os.cpu_count() or 1
     """Number of worker processes on this computer."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ from dual_system.tasks.seeds import HELD_OUT, Split, split_of
 from dual_system.tasks.task import task_names
 from protocol import files, images
 from protocol import messages as m
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 from protocol.errors import FileError
 from protocol.mcap_log import EpisodeRecord, read_log, read_pictures
 
@@ -63,7 +63,7 @@ class ExportOptions:
     """Rate of a demonstration's pictures in Hz; its last frame is always rendered. Training reads 1 Hz by default."""
     only_success: bool = False
     """Leave out episodes that did not succeed."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -28,7 +28,7 @@ from dual_system.data.video import check_image_px
 from dual_system.models.arm import tool_poses
 from dual_system.tasks.geometry import pose_of
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class ImportOptions:
     """Side of the pictures in pixels; others are scaled, and padded to a square with black."""
     episodes: int | None = None
     """Largest number of episodes of each source. None: all."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
     def __post_init__(self) -> None:

@@ -43,7 +43,7 @@ from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import NO_QUERY, PounceBatch, read_cognition
 from protocol import files
-from protocol.command_line import command, flat, parse
+from protocol.command_line import On, command, flat, parse
 
 STALE_BY = (0, 1, 2, 4)
 """k of C_{t-k}, in queries; at 1 Hz also in seconds."""
@@ -74,7 +74,7 @@ class DiagnoseOptions:
     """Device of both networks."""
     dtype: DTypeName = "float32"
     """Number format of both networks' matrices."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -37,7 +37,7 @@ from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.diagnose import in_turns
 from dual_system.training.example import Example
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +56,7 @@ class ProbeOptions:
     """Largest number of episodes, the tasks taking turns."""
     out: Path | None = None
     """Folder for probe.md, which is printed in any case."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -49,7 +49,7 @@ from dual_system.training.recipes import recipe
 from dual_system.training.trainer import CheckpointError, Trainer, num_steps_in
 from dual_system.training.watch import Watch
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _SYSTEMS, CHECKPOINT = ("ponder", "pounce"), "checkpoint"
@@ -111,7 +111,7 @@ class LogOptions:
     """Updates between samples of PONDER's texts (OUT/samples.jsonl)."""
     tensorboard: bool = False
     """Write losses, pictures and samples to OUT/tensorboard as well."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

@@ -30,7 +30,7 @@ from dual_system.training.example import make_example
 from dual_system.training.joint import encode_rows
 from dual_system.training.watch import supervised_spans
 from protocol import files
-from protocol.command_line import command, parse
+from protocol.command_line import On, command, parse
 
 ABOUT = """\
 Teacher-forced, once a second. *Told apart*: whether something new is to be said. *Right*: each token of a text is the
@@ -55,7 +55,7 @@ class WordsOptions:
     """Largest number of episodes, the tasks taking turns."""
     out: Path | None = None
     """Folder for words.md, which is printed in any case."""
-    progress: bool = True
+    progress: On = True
     """Do not show a progress bar."""
 
 

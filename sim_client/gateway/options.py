@@ -16,6 +16,7 @@ from clock.policies import SERVERS, PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from protocol import files
 from protocol.checks import MAX_HORIZON, MAX_IMAGE_SIDE_PX, MAX_INDEX
+from protocol.command_line import On
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Mode, Schedule, WaitKind
 from protocol.options import DaemonOptions, LinkOptions
@@ -109,7 +110,7 @@ class ServersOptions:
 class LogOptions:
     """Logs of episodes."""
 
-    record: bool = True
+    record: On = True
     """Do not write an MCAP per episode."""
     pixels: Literal["jpeg", "exact"] = "jpeg"
     """Form of logged raw frames. jpeg: as JPEG; exact: also bit for bit as the models saw them."""
