@@ -33,7 +33,7 @@ def before_gaps(record: EpisodeRecord) -> tuple[EpisodeRecord, str]:
 
     It ends before the poll of the clock service that is the last one surely whole, and has no result.
     """
-    gaps = [*_of_clock(record), *_of_answers(record)]
+    gaps = [*_of_clock(record), *_last_stamps(record), *_of_answers(record)]
     if not gaps:
         return record, ""
     end_ns = min(gap.at_ns for gap in gaps)
@@ -57,6 +57,18 @@ def before_gaps(record: EpisodeRecord) -> tuple[EpisodeRecord, str]:
 def _of_clock(record: EpisodeRecord) -> Iterator[Gap]:
     for kind in _OF_CLOCK:
         yield from _gaps(kind, [each for each in getattr(record, kind) if each.header.proc == "clock"])
+
+
+def _last_stamps(record: EpisodeRecord) -> Iterator[Gap]:
+    """Stamps that are missing at the end, after all others: what they admitted is played, or referred to."""
+    used = {
+        StampKind.CHUNK: {tick.invocation for tick in record.ticks},
+        StampKind.COGNITION: {invocation.ref_query for invocation in record.invocations},
+    }
+    for kind, indices in used.items():
+        newest = max((stamp.index for stamp in record.stamps if stamp.kind == kind), default=-1)
+        if missing := {index for index in indices if index is not None and index > newest}:
+            yield Gap(max((stamp.header.at_ns for stamp in record.stamps), default=0), "clock", "stamps", len(missing))
 
 
 def _of_answers(record: EpisodeRecord) -> Iterator[Gap]:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from clock.check import disagreements
 from clock.check_gaps import before_gaps
+from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
 
 OF_CLOCK = ("queries", "stamps", "invocations", "actions", "ticks", "events")
@@ -71,6 +72,20 @@ def test_a_lost_answer_ends_it_where_it_was_first_used(position: int, whole: Epi
     part, why = before_gaps(cut)
     assert next(disagreements(part), None) is None
     assert "1 of the chunks of pounce" in why
+
+
+@pytest.mark.parametrize("kind", [m.StampKind.COGNITION, m.StampKind.CHUNK])
+def test_a_lost_last_stamp_is_known_by_what_it_admitted(kind: m.StampKind, whole: EpisodeRecord) -> None:
+    is_chunk = kind == m.StampKind.CHUNK
+    used = [tick.invocation for tick in whole.ticks] if is_chunk else [each.ref_query for each in whole.invocations]
+    last = max(index for index in used if index is not None)
+    at = next(n for n, stamp in enumerate(whole.stamps) if (stamp.kind, stamp.index) == (kind, last))
+    cut = replace(whole, stamps=whole.stamps[:at])
+    assert next(disagreements(cut), None) is not None
+    part, why = before_gaps(cut)
+    assert next(disagreements(part), None) is None
+    assert part.ticks
+    assert "of the stamps of clock never reached the recorder" in why
 
 
 def test_the_command_names_it(
