@@ -77,8 +77,8 @@ def folder(path: Path) -> Path:
     return path
 
 
-def destination(path: Path) -> Path:
-    """Makes the folder of a file that a command writes; returns the file's path.
+def make_way(path: Path) -> None:
+    """Makes the folder of a file that a command writes, and makes sure that no log has the file's place.
 
     Raises:
         OSError: the folder cannot be made or written to, or a log has the file's place.
@@ -88,7 +88,6 @@ def destination(path: Path) -> Path:
         with path.open("rb") as file:
             if file.read(len(_MCAP)) == _MCAP:
                 raise FileExistsError(f"{path} is a log: a record is never overwritten. Name another file")
-    return path
 
 
 def open_file(path: Path) -> BinaryIO:

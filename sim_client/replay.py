@@ -62,7 +62,7 @@ class ReplayConfig:
 def main(argv: list[str] | None = None) -> int:
     config = parse(ReplayConfig, argv, prog="pp-replay")
     for target in filter(None, (config.save, config.screenshot)):
-        files.destination(target)
+        files.make_way(target)
     with tempfile.TemporaryDirectory(prefix="ponderpounce-replay-") as folder:
         rrd = Path(folder) / "episode.rrd"
         t0_unix_ns = convert(config.file, rrd)

@@ -90,7 +90,7 @@ class Compared:
 def main(argv: list[str] | None = None, prog: str = "pp-replay through") -> int:
     config = parse(ThroughConfig, argv, prog=prog)
     if config.rows is not None:
-        files.destination(config.rows)
+        files.make_way(config.rows)
     record = read_log(config.file)
     with files.reading(config.file, "log of an episode"):
         has_other = config.pounce is not None or config.backend != "own"
