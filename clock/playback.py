@@ -65,11 +65,6 @@ def row_of(chunk: Chunk, tick: int) -> int | None:
     return row if 0 <= row < len(chunk.rows_NA) else None
 
 
-def chunk_for(chunks: Sequence[Chunk], tick: int) -> Chunk | None:
-    """The newest chunk that has a row for ``tick``."""
-    return max((c for c in chunks if row_of(c, tick) is not None), key=lambda c: c.invocation, default=None)
-
-
 Join = Callable[[Sequence[Chunk], int], Floats]
 """A seam policy: (chunks with a row for the tick, oldest first, at least one; tick) -> row (action_dim,)."""
 

@@ -10,7 +10,6 @@ from hypothesis.extra import numpy as hnp
 
 from clock.playback import (
     Chunk,
-    chunk_for,
     covering,
     deadline_ns,
     ensemble,
@@ -88,13 +87,13 @@ def test_rows_that_are_past_when_a_chunk_comes_are_never_asked_for(late: int) ->
 @given(chunks_tick=overlapping())
 def test_the_newest_covering_chunk_plays(chunks_tick: tuple[list[Chunk], int]) -> None:
     chunks, tick = chunks_tick
-    assert chunk_for(chunks[::-1], tick) is chunks[-1] is covering(chunks[::-1], tick)[-1]
+    assert covering(chunks[::-1], tick)[-1] is chunks[-1]
 
 
 def test_an_older_chunk_plays_where_the_newest_does_not_reach() -> None:
     old, new = chunk(0, 0), chunk(1, 5)
-    assert chunk_for([old, new], 4) is old
-    assert chunk_for([old, new], 5 + H) is None
+    assert covering([old, new], 4) == [old]
+    assert not covering([old, new], 5 + H)
 
 
 # -- seams

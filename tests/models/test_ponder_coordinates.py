@@ -8,7 +8,6 @@ from dual_system.models.ponder.coordinates import (
     PLACE_WORDS,
     moved_places,
     normalised_text,
-    pixel_text,
     without_places,
     xy_1000_from_yx_px,
     yx_px_from_xy_1000,
@@ -30,10 +29,9 @@ def test_axes_are_swapped_and_scaled() -> None:
     assert xy_1000_from_yx_px((77, 103)) == (402, 301)
 
 
-def test_text_is_rewritten_everywhere_and_back() -> None:
+def test_text_is_rewritten_everywhere() -> None:
     text = "target_0 at <77, 103> → target_1 at <71, 74>"
     assert normalised_text(text) == "target_0 at [402, 301] → target_1 at [289, 277]"
-    assert pixel_text(normalised_text(text)) == text
 
 
 @pytest.mark.parametrize("yx_px", [(-1, 0), (0, 257)])
@@ -56,7 +54,7 @@ def test_the_plain_reading_has_no_place() -> None:
 def test_a_moved_place_is_moved_by_pixels_and_stays_in_the_picture(y: int, x: int, move: tuple[int, int]) -> None:
     moved = moved_places(normalised_text(f"press <{y}, {x}>"), move)
     there = min(max(y + move[1], 0), 256), min(max(x + move[0], 0), 256)
-    assert pixel_text(moved) == "press <{}, {}>".format(*there)
+    assert moved == normalised_text("press <{}, {}>".format(*there))
 
 
 @given(y=st.integers(0, 256), x=st.integers(0, 256))

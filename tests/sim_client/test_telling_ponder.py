@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dual_system.models.ponder.coordinates import YX_PX, pixel_text
+from dual_system.models.ponder.coordinates import XY_1000, YX_PX, yx_px_from_xy_1000
 from protocol import messages as m
 from protocol.link import Link
 from protocol.topics import COGNITION, INVOCATION, SUBGOAL
@@ -92,7 +92,7 @@ def test_displaced_places_are_as_far_off_as_asked_and_stay_there(played: Any) ->
     told = {each.text for each in played(GROUNDED, off_px=12.0).said[m.Cognition]} - {""}
     assert len(told) == 2
     for text in told:
-        (place,) = YX_PX.findall(pixel_text(text))
+        ((x, y),) = XY_1000.findall(text)
         (meant,) = YX_PX.findall(TEXTS[0 if text.startswith("press") else 30][0])
-        off_px = np.hypot(*(int(a) - int(b) for a, b in zip(place, meant, strict=True)))
+        off_px = np.hypot(*(int(a) - int(b) for a, b in zip(yx_px_from_xy_1000((int(x), int(y))), meant, strict=True)))
         assert off_px == pytest.approx(12.0, abs=1.0)

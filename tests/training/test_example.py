@@ -21,7 +21,7 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
 from dual_system.models.pounce.configs import tiny_groot
 from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
-from dual_system.training.chunks import target_rows
+from dual_system.training.chunks import chunk_ticks
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import Example, ExampleConfig, make_example, row_images
@@ -101,14 +101,14 @@ def test_targets_turn_back_into_the_commands(episode_of_noise: MakeEpisode) -> N
     example = example_of(recorded)
     batch = collate_pounce([example], POUNCE, TOKENIZER, STATISTICS)
     for place, asked in enumerate(example.invocations):
+        (ticks,) = chunk_ticks(np.array([asked.tick]), 6, recorded.num_ticks)
         rows = STATISTICS.absolute_targets(batch.actions_INA[place, :, :8].numpy(), recorded.state_TS[asked.tick])
-        np.testing.assert_allclose(rows, target_rows(recorded, asked.tick, 6), atol=1e-5)
+        np.testing.assert_allclose(rows, recorded.action_TA[ticks], atol=1e-5)
         assert not batch.actions_INA[place, :, 8:].any()
 
 
-def test_after_the_end_the_last_command_stays_in_force(episode_of_noise: MakeEpisode) -> None:
-    recorded = episode_of_noise(5)
-    assert np.array_equal(target_rows(recorded, 3, 4), recorded.action_TA[[3, 4, 4, 4]])
+def test_after_the_end_the_last_command_stays_in_force() -> None:
+    assert chunk_ticks(np.array([0, 3]), 4, num_ticks=5).tolist() == [[0, 1, 2, 3], [3, 4, 4, 4]]
 
 
 def test_the_row_writes_what_the_annotations_say(episode_of_noise: MakeEpisode) -> None:

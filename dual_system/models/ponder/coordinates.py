@@ -44,16 +44,6 @@ def normalised_text(text: str, image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -
     return YX_PX.sub(rewrite, text)
 
 
-def pixel_text(text: str, image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -> str:
-    """Rewrites every ``[x, y]`` in ``text`` as ``<y, x>``, the form of the task texts and the viewer."""
-
-    def rewrite(match: re.Match[str]) -> str:
-        y, x = yx_px_from_xy_1000((int(match[1]), int(match[2])), image_px)
-        return f"<{y}, {x}>"
-
-    return XY_1000.sub(rewrite, text)
-
-
 PLACE_WORDS = (
     *(f" [{_scaled(px, 1000, TEXT_PX)}," for px in _PIXELS),
     *(f" {_scaled(px, 1000, TEXT_PX)}]" for px in _PIXELS),

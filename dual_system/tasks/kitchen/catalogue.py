@@ -234,11 +234,6 @@ UNSEEN_BY_PRECISION = (
 """Held-out tasks of the precision-sensitive split."""
 
 
-def is_kitchen_task(name: str) -> bool:
-    """Returns whether a name is one of the twenty-four."""
-    return name in TASKS
-
-
 def kitchen_task(name: str) -> KitchenTask:
     """Returns a task. Raises TaskError for an unknown name."""
     if name not in TASKS:
