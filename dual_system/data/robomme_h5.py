@@ -93,7 +93,7 @@ class RobommeFile:
             is_demonstration_T=np.array([bool(np.ravel(step["info/is_video_demo"][()])[0]) for step in steps]),
             frames=frames,
         )
-        return paired(episode)
+        return paired(episode, self._path)
 
 
 def _steps(group: Any) -> list[int]:

@@ -64,14 +64,16 @@ class Row20:
 NO_PICTURE = -1
 
 
-def paired(episode: SourceEpisode) -> SourceEpisode:
-    """An episode whose rows show what their action led to, as one whose rows show what was seen before it.
+def paired(episode: SourceEpisode, source: Path) -> SourceEpisode:
+    """An episode of ``source`` whose rows show what their action led to, as one of rows that show what was seen before.
 
     What a row shows goes with the next row's action, and so do the texts, which are of that action; what the last
-    action led to has no row.
+    action led to has no row. Raises DatasetError if there is one row.
     """
     if episode.num_rows < 2:
-        raise DatasetError(f"episode {episode.number}: {episode.num_rows} row; an action needs what was seen before it")
+        raise DatasetError(
+            f"{source}: episode {episode.number}: {episode.num_rows} row; an action needs what was seen before it"
+        )
     return replace(
         episode,
         state_T8=episode.state_T8[:-1],
@@ -165,6 +167,8 @@ class LeRobotSource:
                 flags_T = _numbers(table, mapping.demonstration).reshape(-1)
                 require_finite(f"column {mapping.demonstration}", flags_T)
                 is_demonstration_T = flags_T.astype(np.bool_)
+            subgoal = self._texts(table, mapping.subgoal)
+            grounded = self._texts(table, mapping.grounded_subgoal or mapping.subgoal)
         except ValueError as error:
             raise DatasetError(f"{self._root}: episode {number}: {error}") from None
         if mapping.action_kind == "delta":
@@ -179,17 +183,20 @@ class LeRobotSource:
             rows_hz=mapping.rows_hz or self._folder.fps,
             state_T8=state_T8,
             action_T8=action_T8,
-            subgoal=self._texts(table, mapping.subgoal),
-            grounded_subgoal=self._texts(table, mapping.grounded_subgoal or mapping.subgoal),
+            subgoal=subgoal,
+            grounded_subgoal=grounded,
             is_demonstration_T=is_demonstration_T,
             frames=lambda camera, rows: self._folder.frames(number, self._cameras[camera], rows),
         )
-        return paired(episode) if mapping.order == "action first" else episode
+        return paired(episode, self._root) if mapping.order == "action first" else episode
 
     def _texts(self, table: Any, column: str) -> tuple[str, ...]:
         if not column:
             return ("",) * table.num_rows
-        return in_force([str(text or "") for text in table[column].to_pylist()], self._mapping.done_text)
+        texts = table[column].to_pylist()
+        if not all(text is None or isinstance(text, str) for text in texts):
+            raise ValueError(f"column {column} has the type {table[column].type}, expected texts")
+        return in_force([text or "" for text in texts], self._mapping.done_text)
 
 
 def _numbers(table: Any, column: str) -> NDArray[Any]:

@@ -98,7 +98,7 @@ def test_another_rate_is_refused_with_the_way_out(hz: float) -> None:
 
 @given(rows=st.integers(2, 40))
 def test_what_an_action_led_to_goes_before_the_next_one(rows: int) -> None:
-    found = paired(episode(rows))
+    found = paired(episode(rows), Path("set"))
     np.testing.assert_array_equal(found.action_T8[:, 0] - 100, found.state_T8[:, 0] + 1)
     assert found.subgoal == tuple(f"s{row}" for row in range(1, rows))  # of the action
     assert found.num_rows == rows - 1
@@ -107,7 +107,7 @@ def test_what_an_action_led_to_goes_before_the_next_one(rows: int) -> None:
 
 def test_one_row_has_no_pair() -> None:
     with pytest.raises(DatasetError, match="1 row"):
-        paired(episode(1))
+        paired(episode(1), Path("set"))
 
 
 # -- what becomes a row
@@ -315,6 +315,13 @@ def test_delta_actions_are_added_to_their_rows(folder: Path, mapping: Path, tmp_
     before, after = Dataset(folder).rows(0), Dataset(tmp_path / "out").rows(0)
     np.testing.assert_allclose(after.action[:, :7], before.state[:, :7] + before.action[:, :7])
     np.testing.assert_array_equal(after.action[:, 7], before.action[:, 7])
+
+
+def test_a_column_of_numbers_is_no_subgoal(folder: Path, mapping: Path, tmp_path: Path) -> None:
+    mapping.write_text(OURS.replace('subgoal = "subgoal"', 'subgoal = "action"', 1))
+    options = ImportOptions(sources=(folder,), out=tmp_path / "out", mapping=mapping, image_px=16, progress=False)
+    with pytest.raises(DatasetError, match=r"episode 0: column action has the type .*, expected texts"):
+        import_sets(options)
 
 
 def test_episodes_without_subgoals_are_counted(folder: Path, mapping: Path, tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ ARM_JOINTS = tuple(
     )
 )  # fmt: skip
 ROOT_BODY = "gr1"
-HEAD_PITCH = "head_pitch"
 TOOL_SITE = "tool"
 """Between thumb and fingers of the right hand, with the axes of a script's tool: z ahead, y where they close."""
 
