@@ -31,7 +31,7 @@ def kitchen_hand() -> Recipe:
         freeze="none",
         example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8, told=Told(grounded=0.0, simple=2 / 3)),
         train=LAPTOP,
-        num_steps=5_000,
+        num_steps=8_000,
         batch_episodes=8,
         trains="pounce",
         space="native",
