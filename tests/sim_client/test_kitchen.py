@@ -6,13 +6,15 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
-from dual_system.tasks.kitchen import environment
+from dual_system.tasks.kitchen import environment, omron
 from dual_system.tasks.kitchen.catalogue import TASKS
 from dual_system.tasks.kitchen.environment import KitchenEnvironment
 from dual_system.tasks.kitchen.goals import GOAL_SETS
+from dual_system.tasks.kitchen.layout import StateReader
 from dual_system.tasks.task import TaskError, task_names
 from protocol import checks
 from sim_client import evaluate, worlds
@@ -48,6 +50,19 @@ def test_the_robot_is_the_one_of_the_example() -> None:
         assert (ours.name, ours.kind, ours.at_stop) == (theirs.name, theirs.kind, theirs.at_stop)
     assert (robot.state_high >= 0.99).sum() > 40
     assert (robot.state_low == -robot.state_high).all()
+
+
+def test_wherever_its_joints_can_be_is_measured() -> None:
+    """And a little further: the limits of simulated joints are soft."""
+    robot, model = panda_omron(), omron.panda_omron_spec().compile()
+    data, reader = mujoco.MjData(model), StateReader(model)
+    for end in (0, 1):
+        for name in (*omron.ARM_JOINTS, *omron.FINGER_JOINTS):
+            joint = model.joint(name)
+            data.qpos[joint.qposadr[0]] = joint.range[end] + 0.02 * (2 * end - 1)
+        mujoco.mj_forward(model, data)
+        state = reader.state(data)
+        assert ((robot.state_low <= state) & (state <= robot.state_high)).all()
 
 
 def test_a_kitchen_episode_is_of_its_own_suite_and_no_longer_than_the_papers() -> None:
