@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from clock.limits import Hit, out_of_range
 from clock.playback import Chunk
+from clock.report import LEVEL_EVENT
 from clock.sight import unfit_text
 from protocol.messages import EpisodeInfo, Event, Level, Observation, RobotState, Severity
 
@@ -81,4 +82,4 @@ class Alarms:
             Level.STOPPED: "stopped until somebody engages again",
         }[level]
         text = f"{before.name} -> {level.name}: {why}"
-        return [Event(severity=_SEVERITY.get(level, Severity.ERROR), name="level", text=text, tick=tick)]
+        return [Event(severity=_SEVERITY.get(level, Severity.ERROR), name=LEVEL_EVENT, text=text, tick=tick)]

@@ -22,8 +22,10 @@ _TAIL = struct.Struct("<qq")  # cognition reference or -1, age_ns
 PLAYED = (Level.PLAY, Level.STALE)
 
 CLOCK_LOST_EVENT = "clock_lost"
-ADMITTED_EVENT = "admitted"
 """Event of a robot side that ended the episode because no command came for too long."""
+ADMITTED_EVENT = "admitted"
+LEVEL_EVENT = "level"
+"""Event of the clock service whose ladder is on another rung."""
 
 
 def stream_sha256(ticks: Iterable[Tick]) -> str:

@@ -23,7 +23,7 @@ from protocol.link import Link, Stream
 from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
-from sim_client.robot_end import STOPPED_S, is_sound
+from sim_client.robot_end import STOPPED_S, is_sound, stopped_reason
 from sim_client.silence import CLOCK_SILENCE_NS, STALL_NS, Silence
 from sim_client.worlds import World
 
@@ -101,7 +101,7 @@ class RobotSide:
                 if snapshot.status is not Status.ONGOING:
                     return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=self._tick)
                 if self._stopped_ticks > STOPPED_S * self._control_hz:
-                    return self._abort("stopped by the ladder, and nobody engaged it again")
+                    return self._abort(stopped_reason(self.recorder.last_error))
             if self.link.second_sender:  # nobody can say which of the two is meant
                 self._tell(
                     m.Severity.ERROR, DropReason.SECOND_SENDER, f"holding the last command: {self.link.second_sender}"

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
-from clock.report import ADMITTED_EVENT
+from clock.report import ADMITTED_EVENT, LEVEL_EVENT
 from protocol import disk
 from protocol import messages as m
 from protocol.link import Link, Received, Stream
@@ -42,6 +42,8 @@ class Recorder:
         self.ticks: list[m.Tick] = []
         self.stamps: list[m.Stamp] = []
         self.invocations: list[m.Invocation] = []
+        self.last_error = ""
+        """What the episode's last error says, other than that the ladder goes down: that one is its cause."""
         self._answered: set[tuple[m.StampKind, int]] = set()
 
     def begin(self, info: m.EpisodeInfo, path: Path | None) -> None:
@@ -49,7 +51,7 @@ class Recorder:
 
         Raises OSError if the log cannot be made for another reason.
         """
-        self.ticks, self.stamps, self.invocations = [], [], []
+        self.ticks, self.stamps, self.invocations, self.last_error = [], [], [], ""
         self._answered.clear()
         self._log, self._unrecorded = None, ""
         self._superseded = {topic.name: stream.subscription.num_superseded for topic, stream in self._streams}
@@ -124,6 +126,9 @@ class Recorder:
             self.stamps.append(message)
         elif isinstance(message, m.Invocation):
             self.invocations.append(message)
+        elif isinstance(message, m.Event):
+            if message.severity is m.Severity.ERROR and message.name != LEVEL_EVENT:
+                self.last_error = message.text
         elif isinstance(message, m.Cognition) and message.header.proc == "ponder":
             self._answered.add((m.StampKind.COGNITION, message.query))
         elif isinstance(message, m.ActionChunk) and message.header.proc == "pounce":

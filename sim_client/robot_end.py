@@ -39,6 +39,12 @@ _TIME_TURN_S = 0.0005  # what the clocks' offset becomes uncertain by
 Reply = TypeVar("Reply", m.ContractReply, m.OpenReply)
 
 
+def stopped_reason(error: str) -> str:
+    """Why an episode ends that the ladder stopped. ``error``: the last one that was told in it, or ""."""
+    reason = "stopped by the ladder, and nobody engaged it again"
+    return f"{reason}; the last error: {error}" if error else reason
+
+
 def is_sound(link: Link, action: m.Action, obeyed: Obeyed, state: m.Floats | None) -> bool:
     """Whether this robot may be given a command: it has the last word on its own limits. If not, it is counted.
 

@@ -38,7 +38,7 @@ from sim_client.gateway.pictures import check_size, resized
 from sim_client.gateway.rule import sampled
 from sim_client.gateway.servers import Servers
 from sim_client.recorder import Recorder
-from sim_client.robot_end import RobotEnd, is_sound
+from sim_client.robot_end import RobotEnd, is_sound, stopped_reason
 from sim_client.silence import CLOCK_SILENCE_NS, Silence
 
 log = logging.getLogger("pp-gateway")
@@ -323,7 +323,7 @@ class Machine:
         if away_ns := episode.silence.look(time.monotonic_ns()):
             log.warning("this process stood still for %.0f ms", away_ns / 1e6)
         limit_ns = self._plan.patience_ns if node.commands.newest is None else CLOCK_SILENCE_NS
-        why = episode.node.over() or self._servers.objection()
+        why = stopped_reason(self._recorder.last_error) if node.is_over else self._servers.objection()
         if not why and episode.silence.total_ns > limit_ns:
             why = f"no command for {episode.silence.total_ns / 1e6:.0f} ms"
         waiting, self._waiting = self._waiting, []

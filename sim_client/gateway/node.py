@@ -209,12 +209,10 @@ class LiveNode:
             answer = replace(answer, rows_NA=np.stack(rows), levels=(m.Level.HOLD,) * self.num_rows)
         return replace(answer, deadline_ns=due_ns)
 
-    def over(self) -> str:
-        """Why the episode cannot go on; "" while it can."""
-        stopped_ticks = STOPPED_S * self.info.schedule.control_hz
-        if self._stopped_ticks > stopped_ticks and not self.waits_for_person:
-            return "stopped by the ladder, and nobody engaged it again"
-        return ""
+    @property
+    def is_over(self) -> bool:
+        """Whether the ladder has stopped the robot for so long that the episode ends."""
+        return self._stopped_ticks > STOPPED_S * self.info.schedule.control_hz and not self.waits_for_person
 
 
 Node = LockstepNode | LiveNode

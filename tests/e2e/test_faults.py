@@ -88,6 +88,7 @@ def test_without_pounce_the_robot_holds_slows_down_and_stops(ponder_struck: Any)
     num_beyond = len(record.ticks) - ponder_struck.result["steps"]  # the clock may decide one before it hears the end
     assert num_beyond in (0, 1)
     assert "stopped by the ladder" in ponder_struck.result["reason"]
+    assert "pounce" in ponder_struck.result["reason"]
 
 
 def test_a_frozen_pounce_is_noticed_and_the_robot_stops(machine: Any, ponder_struck: Any, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from clock import schedules
 from protocol import messages as m
 from protocol import topics
 from sim_client.episode import RobotSide
+from sim_client.recorder import Recorder
 from sim_client.silence import CLOCK_SILENCE_NS, STALL_NS, Silence
 
 MS = 1_000_000
@@ -31,11 +32,12 @@ class Robot:
         self.events = rig.listener.subscribe(topics.EVENT)
         self.turns_ns: list[int] = []
         self._now_ns, self._info, self._world = 10**12, info, world
-        self._recorder = type("Recorder", (), {"step": lambda self: None})()
+        self._recorder = Recorder(self.robot, "jpeg")
+        self._recorder.begin(info, None)
         monkeypatch.setattr(time, "monotonic_ns", lambda: self._now_ns)
 
-    def command(self, tick: int) -> None:
-        action = m.Action(tick=tick, deadline_ns=tick * 50 * MS, level=m.Level.PLAY, values=np.zeros(3, np.float32))
+    def command(self, tick: int, level: m.Level = m.Level.PLAY) -> None:
+        action = m.Action(tick=tick, deadline_ns=tick * 50 * MS, level=level, values=np.zeros(3, np.float32))
         self.clock.publish(topics.ACTION, action, at_ns=0)
 
     def run(self, turns: list[Callable[[], int]]) -> Any:
@@ -46,7 +48,7 @@ class Robot:
             self._now_ns += next(coming, lambda: 20 * MS)()
 
         actions = self.robot.subscribe(topics.ACTION)
-        side = RobotSide(self.robot, actions, self._world, self._recorder, let_others, 10**10)  # type: ignore[arg-type]
+        side = RobotSide(self.robot, actions, self._world, self._recorder, let_others, 10**10)
         return side.run(self._info, self._world.look(), lambda tick: None)
 
 
@@ -70,6 +72,24 @@ def test_a_clock_that_is_silent_is_lost(robot: Robot) -> None:
     assert (outcome.status, outcome.reason, outcome.num_ticks) == (m.TaskStatus.ABORTED, "clock lost", 1)
     (event,) = robot.events.drain()
     assert event.name == "clock_lost"
+
+
+def test_a_stopped_episode_ends_with_what_stopped_it(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sim_client.episode.STOPPED_S", 0.5)
+
+    def error(name: str, text: str) -> int:
+        event = m.Event(severity=m.Severity.ERROR, name=name, text=text, tick=0)
+        robot.clock.publish(topics.EVENT, event, at_ns=0)
+        return 20 * MS
+
+    def stop(tick: int) -> int:
+        robot.command(tick, m.Level.STOPPED)
+        return 20 * MS
+
+    told = [lambda: error("state_out_of_range", "state 5 is 9"), lambda: error("level", "PLAY -> HOLD")]
+    outcome = robot.run([*told, *(lambda tick=tick: stop(tick) for tick in range(20))])  # type: ignore[misc]
+    assert (outcome.status, outcome.num_ticks) == (m.TaskStatus.ABORTED, 11)
+    assert outcome.reason == "stopped by the ladder, and nobody engaged it again; the last error: state 5 is 9"
 
 
 def test_a_robot_that_stood_still_blames_nobody_else(robot: Robot) -> None:

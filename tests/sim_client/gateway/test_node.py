@@ -161,10 +161,10 @@ def test_live_an_arm_that_stays_stopped_ends_the_episode(info: m.EpisodeInfo) ->
     node = LiveNode(info, 1)
     for tick in range(STOPPED_TICKS):
         node.on_action(commanded(tick, m.Level.STOPPED), 0)
-    assert node.over() == ""
+    assert not node.is_over
     node.on_action(commanded(STOPPED_TICKS, m.Level.STOPPED), 0)
-    assert "nobody engaged" in node.over()
-    assert replace(node, waits_for_person=True).over() == ""
+    assert node.is_over
+    assert not replace(node, waits_for_person=True).is_over
 
 
 @pytest.mark.parametrize("level", [m.Level.HOLD, m.Level.DECELERATE, m.Level.STOPPED])
