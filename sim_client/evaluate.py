@@ -11,6 +11,7 @@ import contextlib
 import os
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Iterable
 from functools import cache
 from multiprocessing.util import Finalize
@@ -56,11 +57,15 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("pp-eval: interrupted; finished episodes are kept, the same command resumes\n")
         return INTERRUPTED
+    all_played = [episode for episode in episodes if "unpaired" not in episode]
     for task in sorted({episode["task"] for episode in episodes}):
-        played = [episode for episode in episodes if episode["task"] == task and "unpaired" not in episode]
+        played = [episode for episode in all_played if episode["task"] == task]
         unpaired = sum(episode["task"] == task for episode in episodes) - len(played)
         left_out = f" ({unpaired} more have no demonstration)" if unpaired else ""
         sys.stdout.write(f"{task}: {sum(e['success'] for e in played)} of {len(played)}{left_out}\n")
+    broken_off = Counter(each["reason"] for each in all_played if each["status"] == m.TaskStatus.ABORTED.name)
+    for reason, number in broken_off.most_common():
+        sys.stdout.write(f"broken off: {number}, {reason}\n")
     folder = shlex.quote(str(options.out))
     sys.stdout.write(f"{options.out / 'results.json'}; tables: pp-tables {folder} --out {folder}\n")
     return DONE

@@ -132,8 +132,10 @@ def test_a_scene_without_a_demonstration_is_a_line_and_no_error(
         assert "the script misses its goal; there is no demonstration" in worlds.why_unpaired(world)
 
     def pretended(job: Job) -> dict[str, object]:
-        unpaired = {"unpaired": "no way"} if job.seed else {}
-        return {"task": job.task, "seed": job.seed, "run": job.run, "success": not job.seed, **unpaired}
+        line = {"task": job.task, "seed": job.seed, "run": job.run, "success": not job.seed, "reason": "no way"}
+        if not job.seed:
+            return line | {"status": "SUCCESS"}
+        return line | {"status": "ABORTED", **({"unpaired": "no way"} if job.seed < 3 else {})}
 
     class Here:
         def __init__(self, num_workers: int, play: object) -> None:
@@ -143,6 +145,8 @@ def test_a_scene_without_a_demonstration_is_a_line_and_no_error(
             yield from ((job, pretended(job)) for job in jobs)
 
     monkeypatch.setattr(evaluate, "LocalWorkers", Here)
-    arguments = ["--tasks", "OpenDrawer", "--episodes", "3", "--runs", "1", "--no-progress"]
+    arguments = ["--tasks", "OpenDrawer", "--episodes", "4", "--runs", "1", "--no-progress"]
     assert evaluate.main(["--out", str(tmp_path), *arguments]) == evaluate.DONE
-    assert "OpenDrawer: 1 of 1 (2 more have no demonstration)" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "OpenDrawer: 1 of 2 (2 more have no demonstration)" in told
+    assert "broken off: 1, no way\n" in told
