@@ -387,6 +387,20 @@ def paper() -> m.Schedule:
 
 
 @pytest.fixture(scope="module")
+def short_warm_up() -> Iterator[None]:
+    """Real engines in this process measure two answers instead of fifty: in lockstep nobody asks how fast they are."""
+    from ponder_server import engine as ponder_engine
+    from pounce_server import engine as pounce_engine
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("NUM_UNMEASURED_FIRES", "NUM_MEASURED_FIRES"):
+            patch.setattr(ponder_engine, name, 1)
+        for name in ("WARM_UP_UNMEASURED", "WARM_UP_MEASURED"):
+            patch.setattr(pounce_engine, name, 1)
+        yield
+
+
+@pytest.fixture(scope="module")
 def rounding_interpreter() -> Iterator[None]:
     """Triton's interpreter (3.6), made to round as a GPU does, and to count as NumPy 2.4 wants it.
 

@@ -29,7 +29,7 @@ CHANNELS: dict[str, Callable[[], Any]] = {
     "none": lambda: tiny_cpu(num_carriers=0),
 }
 """POUNCE's configuration; PONDER's is the same for all."""
-EPISODE = "--in-process --task PickXtimes --max-steps 25 --pixels exact --no-progress"
+EPISODE = "--in-process --task PickXtimes --max-steps 21 --pixels exact --no-progress"
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def logs(folders: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def logs(short_warm_up: None, folders: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     found = {}
     for name, folder in folders.items():
         out = tmp_path_factory.mktemp(name)
