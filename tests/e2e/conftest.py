@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -19,6 +20,8 @@ from protocol.link import Link, Stream
 from protocol.mcap_log import EpisodeRecord, read_log
 from protocol.topics import EVENT, TICK
 from protocol.zenoh_bus import Endpoints, ZenohBus
+from sim_client import evaluate
+from sim_client.condition import Job
 from sim_client.launch import Daemons, free_ports, start_local
 
 PATIENCE_S = 60.0  # for anything; a loaded machine takes 15 s to start PONDER
@@ -163,6 +166,30 @@ def run_module() -> Callable[..., subprocess.CompletedProcess[str]]:
         return subprocess.run(
             command, env=ENVIRONMENT, capture_output=True, text=True, timeout=2 * PATIENCE_S, check=False
         )
+
+    return run
+
+
+class _Here:
+    """Instead of workers."""
+
+    def __init__(self, num_workers: int, play: Callable[[Job], evaluate.Line]) -> None:
+        pass
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, evaluate.Line]]:
+        with contextlib.closing(evaluate.EvaluationHarness(jobs[0].options)) as harness:
+            for job in jobs:
+                yield job, harness.play(job)
+
+
+@pytest.fixture
+def evaluate_here(short_warm_up: None, monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[str]], int]:
+    """``pp-eval`` without a worker, which would import and warm up everything for itself."""
+
+    def run(arguments: Sequence[str]) -> int:
+        with monkeypatch.context() as patch:
+            patch.setattr(evaluate, "LocalWorkers", _Here)
+            return evaluate.main([*arguments])
 
     return run
 

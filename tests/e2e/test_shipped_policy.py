@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 from dual_system.models.ponder.checkpoint import load_ponder, weights_hash
 from dual_system.models.pounce.checkpoint import load_bundle
-from sim_client import evaluate
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
 SHIPPED = CHECKPOINTS / "small"
@@ -41,7 +41,9 @@ def test_its_results_are_of_these_weights(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.e2e
-def test_it_picks_what_was_highlighted_and_without_cognition_it_does_not(tmp_path: Path) -> None:
+def test_it_picks_what_was_highlighted_and_without_cognition_it_does_not(
+    evaluate_here: Callable[[Sequence[str]], int], tmp_path: Path
+) -> None:
     """Three easy scenes that nothing was chosen by. Rounding differs between machines, so the bar is low."""
     solved = {}
     for cognition in ("real", "null"):
@@ -51,7 +53,7 @@ def test_it_picks_what_was_highlighted_and_without_cognition_it_does_not(tmp_pat
             f"--difficulty easy --episodes {NUM_SCENES} --seed {FIRST_SEED} --runs 1 --max-steps 300 "
             f"--cognition {cognition} --no-progress --out {out}"
         )
-        assert evaluate.main(arguments.split()) == 0
+        assert evaluate_here(arguments.split()) == 0
         results = json.loads((out / "results.json").read_text())
         solved[cognition] = sum(episode["success"] for episode in results["episodes"])
     assert solved["real"] >= 2
