@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -18,6 +17,7 @@ from ponderpounce_robocasa import layout
 from clock.check import disagreements
 from dual_system.data.episode import About, EpisodeWriter, RobotColumns, Row, unpack
 from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.training import train
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
 from protocol.process import ENDING_S
@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 TASK, INSTRUCTION, SEEDS = "OpenDrawer", "open the left drawer", (0, 1)
-MAX_STEPS, ROWS, DEMO_FRAMES = 70, layout.NUM_ROWS, 3
+MAX_STEPS, ROWS, DEMO_FRAMES = 40, layout.NUM_ROWS, 3
 PATIENCE_S = 120.0
 ENVIRONMENT = os.environ | {
     "OMP_NUM_THREADS": "1",
@@ -36,7 +36,7 @@ ENVIRONMENT = os.environ | {
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory, run_module: Callable[..., subprocess.CompletedProcess[str]]) -> Path:
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A step of ``tiny_robocasa_dc`` on an episode of noise, after a demonstration by another body."""
     folder = tmp_path_factory.mktemp("pair")
     robot = RobotColumns(
@@ -66,8 +66,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory, run_module: Callable[..., sub
     writer.finish()
     arguments = ["--recipe", "tiny_robocasa_dc", "--data", str(folder / "set"), "--out", str(folder / "run")]
     arguments += ["--steps", "1", "--batch-episodes", "1", "--max-invocations", "1", "--no-progress"]
-    done = run_module("dual_system.training.train", *arguments)
-    assert done.returncode == 0, done.stderr
+    assert train.main(arguments) == 0
     return folder / "run"
 
 
