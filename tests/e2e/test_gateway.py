@@ -27,7 +27,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:connect.. must be used as a context:DeprecationWarning"),  # openpi-client's
 ]
 
-NUM_REQUESTS, NUM_ROWS = 4, 10
+NUM_REQUESTS, NUM_ROWS = 3, 10
 PATIENCE_S = 90.0
 
 
@@ -61,7 +61,7 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[dic
         "openpi_client.websocket_client_policy", reason="pip install --no-deps openpi-client==0.1.2"
     )
     out = tmp_path_factory.mktemp("gateway")
-    gateway = Gateway(out, "--dialect", "openpi", "--rows", str(NUM_ROWS))
+    gateway = Gateway(out, "--dialect", "openpi", "--rows", str(NUM_ROWS), "--ponder", "none")
     client = client_module.WebsocketClientPolicy("127.0.0.1", gateway.port)
     try:
         answers = []
