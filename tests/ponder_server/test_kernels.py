@@ -360,6 +360,7 @@ def test_a_shape_is_tried_once_and_the_memory_is_left_alone(ponder: Ponder, monk
     assert all((tensor == 7.0).all() for tensor in memory.states(1))
 
 
+@pytest.mark.usefixtures("short_warm_up")
 def test_a_warm_engine_says_which_kernels_it_took(ponder: Ponder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ponder_server.captured.KERNELS", replace(TWINS, swiglu=lambda gate, up: gate))
     options = EngineConfig(max_sessions=1, max_context_tokens=512, buckets=(64,), max_batch_rows=1)

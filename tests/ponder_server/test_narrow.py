@@ -94,6 +94,7 @@ def test_measuring_it_leaves_no_session_behind() -> None:
         engine.open(str(name), Opening(instruction="press"))
 
 
+@pytest.mark.usefixtures("short_warm_up")
 @narrow
 def test_the_server_says_it_in_its_health_and_log(
     weights: WeightsName, new_rig: Any, caplog: pytest.LogCaptureFixture

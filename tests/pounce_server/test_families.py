@@ -37,9 +37,11 @@ SPEC = EngineSpec(
 
 Info = Callable[..., m.EpisodeInfo]
 
+pytestmark = pytest.mark.usefixtures("short_warm_up")
+
 
 @pytest.fixture(scope="module")
-def episodes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, EpisodeRecord]:
+def episodes(short_warm_up: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, EpisodeRecord]:
     """PickHighlight by both families in lockstep: all is real but the bus, and only the folder differs."""
     records = {}
     for family, config in FAMILIES.items():

@@ -47,6 +47,7 @@ def test_an_engine_acts_nearly_alike_and_tells_how_nearly(config: Any, dtype: DT
     np.testing.assert_array_equal(narrow.invoke(request), narrow.invoke(request))
 
 
+@pytest.mark.usefixtures("short_warm_up")
 def test_the_server_says_it_in_its_health_and_log(new_rig: Any, caplog: pytest.LogCaptureFixture) -> None:
     engine = EagerEngine(random_bundle(tiny_cpu(), seed=0), weights="int8")
     link = new_rig().links["pounce"]
