@@ -66,7 +66,7 @@ def assert_alike(some: list[Fire], others: list[Fire], atol: float = TOLERANCE) 
         assert [text.token_ids for text in one.texts] == [text.token_ids for text in other.texts]
 
 
-@pytest.mark.parametrize("weights", ["float", "int8", "fp8"])
+@pytest.mark.parametrize("weights", ["float", pytest.param("int8", marks=pytest.mark.acceptance), "fp8"])
 def test_an_episode_is_the_eager_one(weights: WeightsName) -> None:
     """Also with narrow weights: what is captured are these."""
     eager, captured = (engine_of(capture, weights) for capture in (None, directly))

@@ -171,7 +171,11 @@ def test_untrained_heads_guess_something() -> None:
 
 @pytest.mark.parametrize(
     ("strength", "num_tokens"),
-    [(1.0, 3), pytest.param(0.3, 5, marks=pytest.mark.acceptance), (0.3, MAX_DRAFT_TOKENS)],
+    [
+        pytest.param(1.0, 3, marks=pytest.mark.acceptance),
+        pytest.param(0.3, 5, marks=pytest.mark.acceptance),
+        (0.3, MAX_DRAFT_TOKENS),
+    ],
 )
 def test_texts_are_greedy_texts_whatever_the_weights(strength: float, num_tokens: int) -> None:
     """Random heads accept almost nothing, doctored ones a part, and all of it in rows that share forwards."""

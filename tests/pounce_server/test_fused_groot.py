@@ -134,7 +134,7 @@ def small() -> GrootPounceConfig:
 
 @pytest.mark.skipif(bool(LACK), reason=LACK)
 @pytest.mark.usefixtures("rounding_interpreter")
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.acceptance)])
 def test_kernels_in_the_interpreter_act_as_the_eager_model(dtype: DTypeName, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pounce_server.fused.BUCKET_TOKENS", 8)
     config = replace(small(), max_prompt_tokens=8)

@@ -54,7 +54,14 @@ def long_folder(
     return write_dataset(tmp_path_factory.mktemp("long") / "set", [package])
 
 
-@pytest.mark.parametrize(("rule", "until"), [("spread", "observation"), ("newest", "observation"), ("spread", "query")])
+@pytest.mark.parametrize(
+    ("rule", "until"),
+    [
+        pytest.param("spread", "observation", marks=pytest.mark.acceptance),
+        ("newest", "observation"),
+        ("spread", "query"),
+    ],
+)
 def test_training_and_serving_read_the_same_pictures(
     rule: Any, until: Any, long_folder: Path, episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
 ) -> None:

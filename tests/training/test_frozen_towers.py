@@ -46,7 +46,7 @@ def one_step(run: Recipe, folder: Path, store: Path, *, embeds: bool) -> tuple[J
     return model, trainer, (report, batches(0))
 
 
-@pytest.mark.parametrize("name", ["tiny", "tiny_framesamp", "tiny_current"])
+@pytest.mark.parametrize("name", ["tiny", "tiny_framesamp", pytest.param("tiny_current", marks=pytest.mark.acceptance)])
 def test_features_give_the_step_that_pictures_give(
     name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
