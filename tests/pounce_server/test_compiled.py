@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.pounce.checkpoint import random_bundle
@@ -22,7 +23,20 @@ def _shallow() -> PounceConfig:
     return replace(config, pi05=replace(config.pi05, **streams), num_steps=2)
 
 
+@pytest.fixture(params=["aot_eager", pytest.param("inductor", marks=pytest.mark.acceptance)])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What runs the graphs that torch traces. Inductor's C++ takes a minute to compile where nothing is cached."""
+    compiled = torch.compile
+
+    def traced(function: Any, *, mode: str) -> Any:
+        by_inductor = compiled(function, mode=mode)
+        return by_inductor if request.param == "inductor" else compiled(function, backend=request.param)
+
+    monkeypatch.setattr("pounce_server.compiled.torch.compile", traced)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("backend")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 @pytest.mark.parametrize("config", [_shallow(), pytest.param(tiny_groot(), marks=pytest.mark.acceptance)])
 def test_compiled_rows_are_the_eager_ones(config: Any) -> None:
