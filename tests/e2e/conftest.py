@@ -144,8 +144,9 @@ class Machine:
         self._daemons.__exit__(None, None, None)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """One for all files: whatever a test strikes, it brings back."""
     machine = Machine(tmp_path_factory.mktemp("daemons"))
     yield machine
     machine.end()
