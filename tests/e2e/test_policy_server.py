@@ -64,7 +64,7 @@ def test_its_rows_are_played_and_without_it_the_robot_holds_slows_down_and_stops
     machine: Any, policy: Policy, tmp_path: Path
 ) -> None:
     player = machine.play(tmp_path, "--ponder", "none", "--max-steps", "400")
-    player.wait_for_tick(30)
+    player.wait_for_tick(15)
     policy.process.send_signal(19)  # SIGSTOP
     player.wait_for_level(m.Level.HOLD)
     policy.process.send_signal(18)  # SIGCONT
@@ -88,7 +88,7 @@ def test_its_rows_are_played_and_without_it_the_robot_holds_slows_down_and_stops
 
 def test_a_policy_that_came_back_plays_the_next_episode(machine: Any, policy: Policy, tmp_path: Path) -> None:
     policy.start()
-    episode = machine.play(tmp_path, "--ponder", "none", "--max-steps", "40").wait_for_end()
+    episode = machine.play(tmp_path, "--ponder", "none", "--max-steps", "25").wait_for_end()
     assert next(disagreements(episode.record), None) is None
-    assert episode.result["steps"] == 40
+    assert episode.result["steps"] == 25
     assert {tick.level for tick in episode.record.ticks} <= {m.Level.PLAY, m.Level.SKIPPED}

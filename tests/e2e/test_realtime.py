@@ -13,7 +13,7 @@ from protocol import messages as m
 
 pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.sim, pytest.mark.slow]
 
-NUM_TICKS = 100
+NUM_TICKS = 60
 
 
 @pytest.fixture(scope="module")
