@@ -20,6 +20,7 @@ from websockets.sync.client import connect
 VERSION = 1
 ROBOT_STATES = ("ok", "user_stop", "protective_stop", "fault", "torque_off")
 _NUM_EXCHANGES = 8
+_CLOSE_S = 1.0  # a gateway that is frozen says no goodbye
 _JPEG_MAGIC = b"\xff\xd8"
 
 
@@ -96,7 +97,8 @@ class Client:
         self._url, self._patience_s, self._silence_s = url, patience_s, silence_s
         self._seq, self._has_command = 0, False
         self._opened = contextlib.ExitStack()
-        options: dict[str, Any] = {"compression": None, "max_size": None, "open_timeout": min(10.0, patience_s)}
+        options: dict[str, Any] = {"compression": None, "max_size": None, "close_timeout": _CLOSE_S}
+        options["open_timeout"] = min(10.0, patience_s)
         if "proxy" in inspect.signature(connect).parameters:  # a robot is not reached through a proxy for the web
             options["proxy"] = None
         if api_key:
