@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dual_system.models.embedding import Embedding
 from dual_system.models.stack import Stack
 
 LAYER_NORM_EPS = 1e-6
@@ -100,7 +101,7 @@ class VisionTower(nn.Module):
         super().__init__()
         self.config = config
         self.patch_embedding = nn.Conv2d(3, config.width, config.patch_px, stride=config.patch_px)
-        self.position_embedding = nn.Embedding(config.num_patches, config.width)
+        self.position_embedding = Embedding(config.num_patches, config.width)
         self.layers = Stack[VisionLayer](VisionLayer(config) for _ in range(config.depth))
         self.post_layernorm = Float32LayerNorm(config.width)
 

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dual_system.models.embedding import Embedding
 from dual_system.models.flow import EulerStep
 from dual_system.models.groot import flow as groot_flow
 from dual_system.models.groot.blocks import (
@@ -120,8 +121,8 @@ class Groot(nn.Module):
         self.state_encoder = EmbodimentMlp(config.num_embodiments, config.state_dim, hidden, width)
         self.action_encoder = ActionEncoder(config.num_embodiments, config.action_dim, width)
         self.action_decoder = EmbodimentMlp(config.num_embodiments, hidden, hidden, config.action_dim)
-        self.future_tokens = nn.Embedding(config.num_future_tokens, width)
-        self.position_embedding = nn.Embedding(config.max_actions, width)
+        self.future_tokens = Embedding(config.num_future_tokens, width)
+        self.position_embedding = Embedding(config.max_actions, width)
         self.dit = Dit(
             config.dit, source_width=config.mixer.width, width_out=hidden, time_channels=config.time_channels
         )

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dual_system.models.embedding import Embedding
 from dual_system.models.pi05.gemma import Rotation, attend
 from dual_system.models.stack import Stack
 
@@ -112,7 +113,7 @@ class Qwen3(nn.Module):
     def __init__(self, config: Qwen3Config) -> None:
         super().__init__()
         self.config = config
-        self.embed_tokens = nn.Embedding(config.vocab_size, config.width)
+        self.embed_tokens = Embedding(config.vocab_size, config.width)
         self.layers = Stack[Qwen3Layer](Qwen3Layer(config) for _ in range(config.depth))
         self.norm = PlainRmsNorm(config.width, config.norm_eps)
 

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dual_system.models.embedding import Embedding
 from dual_system.models.stack import Stack
 
 RMS_NORM_EPS = 1e-6
@@ -168,7 +169,7 @@ class LanguageModel(nn.Module):
 
     def __init__(self, config: GemmaConfig, vocab_size: int) -> None:
         super().__init__()
-        self.embed_tokens = nn.Embedding(vocab_size, config.width)
+        self.embed_tokens = Embedding(vocab_size, config.width)
         self.layers = Stack[GemmaLayer](GemmaLayer(config) for _ in range(config.depth))
         self.norm = RmsNorm(config.width)
 

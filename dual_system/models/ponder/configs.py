@@ -4,13 +4,16 @@ The four real sizes have exactly the published number of parameters (without the
 which transformers omits). Source: Qwen3.5 model cards; tests/models checks them on the meta device.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from __future__ import annotations
 
-from transformers.models.qwen3_5 import Qwen3_5Config
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from dual_system.models.ponder.vocabulary import Vocabulary
 from dual_system.models.windows import LAPTOP_WINDOWS, WHOLE, Box
+
+if TYPE_CHECKING:
+    from transformers.models.qwen3_5 import Qwen3_5Config
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +66,8 @@ class PonderConfig:
 
     def qwen(self, vocabulary: Vocabulary | None = None) -> Qwen3_5Config:
         """The transformers configuration; token ids come from ``vocabulary`` when there is one."""
+        from transformers.models.qwen3_5 import Qwen3_5Config  # here, because POUNCE's server reads these sizes, too
+
         token_ids: dict[str, Any] = {}
         if vocabulary is not None:
             token_ids = {
