@@ -175,17 +175,17 @@ class Physics:
         force_of_finger = {finger: np.zeros(3) for finger in self._fingers}
         body = self.model.body(name).id
         wrench = np.empty(6)
-        for index, contact in enumerate(self.data.contact[: self.data.ncon]):
-            first, second = (int(self.model.geom_bodyid[geom]) for geom in contact.geom)
-            if body not in (first, second):
-                continue
+        contacts = self.data.contact
+        bodies_n2 = self.model.geom_bodyid[contacts.geom]
+        for index in np.flatnonzero((bodies_n2 == body).any(axis=1)):
+            first, second = map(int, bodies_n2[index])
             finger = self._owner.get(second if first == body else first)
             if finger is None:
                 continue
             mujoco.mj_contactForce(self.model, self.data, index, wrench)
             # The contact frame's x axis points from the first geom to the second: flip it to point into the finger.
             into_finger = 1.0 if first == body else -1.0
-            force_of_finger[finger] += into_finger * (wrench[:3] @ contact.frame.reshape(3, 3))
+            force_of_finger[finger] += into_finger * (wrench[:3] @ contacts.frame[index].reshape(3, 3))
         return bool(force_of_finger) and all(self._presses(*item) for item in force_of_finger.items())
 
     def _presses(self, finger: int, force_n: Array) -> bool:
