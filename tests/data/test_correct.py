@@ -24,7 +24,7 @@ from dual_system.training.example import ExampleConfig, make_example
 from protocol.mcap_log import EpisodeRecord, read_log
 from sim_client.config import LogOptions
 
-PARTS = 4
+PARTS = 3
 
 pytestmark = pytest.mark.sim
 
@@ -46,7 +46,7 @@ class HereAndNow:
 @pytest.fixture(scope="module")
 def log(recorded: Callable[..., Path]) -> Path:
     """Of an episode whose pictures nobody keeps."""
-    return recorded("PickXtimes", 6, LogOptions(record_hz=1))
+    return recorded("PickXtimes", 2, LogOptions(record_hz=1))  # of one round
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def record(log: Path) -> EpisodeRecord:
 
 
 def options(log: Path, out: Path) -> CorrectOptions:
-    return CorrectOptions(files=(log,), out=out, per_episode=PARTS, record_hz=1, workers=1, progress=False)
+    return CorrectOptions(files=(log,), out=out, per_episode=PARTS, record_hz=1, image_px=64, workers=1, progress=False)
 
 
 @pytest.fixture(scope="module")
