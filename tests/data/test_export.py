@@ -53,7 +53,16 @@ def collected() -> list[Row]:
     return rows
 
 
-def test_a_folder_stands_for_all_logs_below_it(log: Path, tmp_path: Path) -> None:
+def begun(record: EpisodeRecord, num_ticks: int) -> EpisodeRecord:
+    """What a log holds of an episode that was left after so many ticks."""
+    return dataclasses.replace(record, ticks=record.ticks[:num_ticks], result=None)
+
+
+def test_a_folder_stands_for_all_logs_below_it(
+    log: Path, record: EpisodeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short = read_episode(log, begun(record, 2), demonstration_hz=1)
+    monkeypatch.setattr(module, "read_episode", lambda path, record, **options: short)
     for name in ("deep/b.mcap", "a.mcap"):
         (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "logs" / name).symlink_to(log)
@@ -89,7 +98,7 @@ def test_played_again_its_texts_are_those_that_collecting_tells(name: str, reque
     with make_environment(record.info.task, render=False, texts_follow=True) as environment:
         job = dataclasses.replace(JOB, task=record.info.task)
         play(environment, job, SEED, take=lambda row, frames: rows.append(row))
-    again = read_episode(path, record, texts="follow")
+    again = read_episode(path, record, texts="follow", demonstration_hz=1)
     assert again.rows.grounded_subgoal == tuple(row.grounded_subgoal for row in rows)
     assert again.rows.subgoal == tuple(row.subgoal for row in rows)
     assert again.rows.is_transition.tolist() == [row.is_transition for row in rows]
@@ -97,8 +106,7 @@ def test_played_again_its_texts_are_those_that_collecting_tells(name: str, reque
 
 def test_an_episode_that_ends_early_is_exported_up_to_its_end(rounds: Path) -> None:
     record, at = read_log(rounds), 40
-    begun = dataclasses.replace(record, ticks=record.ticks[:at], result=None)
-    cut = read_episode(rounds, begun, texts="follow")
+    cut = read_episode(rounds, begun(record, at), texts="follow")
     assert not cut.about.is_success
     assert len(cut.rows) == at
     whole = read_episode(rounds, record, texts="follow")
@@ -118,7 +126,7 @@ def test_what_goes_otherwise_here_is_refused(log: Path, record: EpisodeRecord) -
     moved = dataclasses.replace(record.observations[9], proprio=record.observations[9].proprio + 1e-3)
     other = dataclasses.replace(record, observations=[*record.observations[:9], moved, *record.observations[10:]])
     with pytest.raises(DatasetError, match="at tick 9 the robot stands"):
-        read_episode(log, other, texts="follow")
+        read_episode(log, other, texts="follow", demonstration_hz=1)
 
 
 def test_it_says_where_the_episode_is_from(exported: Dataset) -> None:
