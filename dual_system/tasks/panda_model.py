@@ -181,13 +181,18 @@ def cluster(vertices: Array, faces: NDArray[np.int32], *, cell_m: float) -> tupl
     Vertex clustering after Rossignac and Borrel, "Multi-resolution 3D approximations", 1993.
     """
     cells = np.round(vertices / cell_m).astype(np.int64)
-    _, cell_of_vertex, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    cell_of_vertex = cell_of_vertex.reshape(-1)  # numpy 2.0 alone returns it with a second axis
+    _, cell_of_vertex, count = np.unique(_numbered(cells), return_inverse=True, return_counts=True)
     merged = np.zeros((len(count), 3))
     np.add.at(merged, cell_of_vertex, vertices)
     merged /= count[:, None]
     corners = cell_of_vertex[faces]
     a, b, c = corners.T
     corners = corners[(a != b) & (b != c) & (c != a)]
-    _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+    _, first = np.unique(_numbered(np.sort(corners, axis=1)), return_index=True)
     return merged, corners[first].astype(np.int32)
+
+
+def _numbered(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each row (n, 3), in the rows' order: NumPy sorts numbers many times faster than rows."""
+    from_zero = rows - rows.min(axis=0, initial=0)
+    return np.ravel_multi_index(tuple(from_zero.T), tuple(from_zero.max(axis=0, initial=0) + 1)).astype(np.int64)
