@@ -62,7 +62,8 @@ def test_without_its_cue_a_scene_and_its_retellings_look_alike(task: str, step: 
             if environment.has_demonstration:
                 return next(environment.demonstration()).frames["front"]
             hold = environment.reset(SEED, layout=environment.layout).command
-            return [environment.step(hold) for _ in range(step)][-1].frames["front"]
+            looks = [at == step for at in range(1, step + 1)]
+            return [environment.step(hold, look=look) for look in looks][-1].frames["front"]
 
     assert not np.array_equal(pictures("own", None), pictures("own", 0))
     np.testing.assert_array_equal(pictures("without-cue", None), pictures("without-cue", 0))

@@ -50,7 +50,7 @@ def test_rendering_changes_neither_state_nor_text(rendered: Environment, pick_hi
 def test_rays_and_renderer_see_the_same_pixels(rendered: Environment, recorded_layout: Layout, body: str) -> None:
     rendered.reset(0, layout=recorded_layout)
     for _ in range(35):
-        rendered.step(FORWARD)
+        rendered.step(FORWARD, look=False)
     cameras = Cameras(rendered.physics, 256)
     try:
         geom = rendered.physics.model.geom(body).id
@@ -91,9 +91,9 @@ def test_cubes_have_their_colors(rendered: Environment, recorded_layout: Layout)
 def test_highlights_are_clearly_white_and_only_when_due(rendered: Environment, recorded_layout: Layout) -> None:
     rendered.reset(0, layout=recorded_layout)
     area_px = {}
-    for _ in range(101):
-        snapshot = rendered.step(HOME)
-        if snapshot.step in (9, 10, 100, 101):
+    for step in range(1, 102):
+        snapshot = rendered.step(HOME, look=step in (9, 10, 100, 101))
+        if snapshot.frames:
             area_px[snapshot.step] = int(is_white(snapshot.frames[FRONT]).sum())
     assert area_px[9] == area_px[101]
     assert area_px[10] == area_px[100]
@@ -124,12 +124,16 @@ def test_a_picture_of_another_size_is_another_size() -> None:
 )
 def test_gl_settings_that_this_computer_does_not_have_are_named(settings: dict[str, str], said: str) -> None:
     code = (
+        "from types import SimpleNamespace\n"
         "from protocol.command_line import command\n"
         "import dual_system.tasks.headless\n"
-        "from dual_system.tasks.environment import make_environment\n"
+        "import mujoco\n"
+        "from dual_system.tasks.rendering import Cameras\n"
         "@command('draw')\n"
         "def main(argv):\n"
-        "    make_environment('PickHighlight', image_px=16).reset(0)\n"
+        "    world = '<mujoco><worldbody><camera name=\"front\"/></worldbody></mujoco>'\n"
+        "    model = mujoco.MjModel.from_xml_string(world)\n"
+        "    Cameras(SimpleNamespace(model=model, data=mujoco.MjData(model)), 16, ['front']).frames()\n"
         "    return 0\n"
         "raise SystemExit(main([]))"
     )
