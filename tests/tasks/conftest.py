@@ -16,18 +16,51 @@ import pytest
 
 from dual_system.tasks import panda
 from dual_system.tasks.engine import Status
-from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.environment import (
+    IMAGE_PX,
+    MAX_STEPS,
+    Environment,
+    EpisodeState,
+    Snapshot,
+    make_environment,
+)
 from dual_system.tasks.geometry import pose
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import PlacedCube
 from dual_system.tasks.reference.pick_highlight import Layout
 from dual_system.tasks.scene import add_button, add_cube, add_disc, table_scene
+from dual_system.tasks.task import make_task
 
 
 @pytest.fixture(scope="session")
 def environment() -> Callable[[str], Environment]:
     """Returns one environment without cameras per task name; building a scene takes longer than resetting it."""
     return functools.cache(lambda name: make_environment(name, render=False))
+
+
+class Remembering(Environment):
+    """An environment without cameras that acts out the video of a start once: a start seen lately is restored."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(make_task(name), image_px=IMAGE_PX, render=False, max_steps=MAX_STEPS)
+        self._starts: dict[tuple[int, str | None, Any], EpisodeState] = {}
+
+    def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
+        start = (seed, difficulty, layout)
+        if start in self._starts:
+            return self.restore(self._starts[start])
+        snapshot = super().reset(seed, difficulty, layout=layout)
+        if self.has_demonstration:
+            self._starts[start] = self.save()
+            for oldest in list(self._starts)[:-6]:
+                del self._starts[oldest]
+        return snapshot
+
+
+@pytest.fixture(scope="session")
+def remembering() -> Callable[[str], Environment]:
+    """As `environment`, for tests that often begin with the same video."""
+    return functools.cache(Remembering)
 
 
 @pytest.fixture(scope="session")

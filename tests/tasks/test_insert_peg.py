@@ -37,8 +37,8 @@ LAYOUT = Layout(
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("InsertPeg")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("InsertPeg")
 
 
 def start(env: Environment, **changes: str) -> Snapshot:

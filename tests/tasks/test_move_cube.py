@@ -29,8 +29,8 @@ DEEDS: dict[str, Deed] = {
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("MoveCube")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("MoveCube")
 
 
 def start(env: Environment, manner: str, seed: int = 3) -> Snapshot:
@@ -147,11 +147,9 @@ def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(env: Environment, p
 
 def test_a_scene_whose_video_the_arm_cannot_act_out_is_drawn_again(env: Environment) -> None:
     seed = 710_001
-    first = MoveCube().sample(np.random.default_rng(seed), "hard")
+    rng = np.random.default_rng(seed)
+    first, *others = [MoveCube().sample(rng, "hard") for _ in range(4)]
     with pytest.raises(UnreachableError):
         env.reset(seed, "hard", layout=first)
     env.reset(seed, "hard")
-    drawn = env.layout
-    assert drawn != first
-    env.reset(seed, "hard")
-    assert env.layout == drawn
+    assert env.layout in others

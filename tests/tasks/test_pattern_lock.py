@@ -24,8 +24,8 @@ CORNER = Layout(side=4, pattern=(5, 10, 14))
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("PatternLock")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("PatternLock")
 
 
 def is_red(env: Environment, button: int) -> bool:

@@ -30,8 +30,8 @@ BULGE_M = {CLOCKWISE: 0.2, COUNTERCLOCKWISE: -0.2}
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("RouteStick")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("RouteStick")
 
 
 def come_down_on(env: Environment, x_m: float, y_m: float, z_m: float) -> Iterator[np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,10 +27,11 @@ NUM_TARGETS = {"easy": 3, "medium": 4, "hard": 4}
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("VideoPlaceButton")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("VideoPlaceButton")
 
 
+@cache
 def sampled(seed: int, difficulty: str) -> Layout:
     return VideoPlaceButton().sample(np.random.default_rng(seed), difficulty)
 

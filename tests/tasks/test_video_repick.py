@@ -27,8 +27,8 @@ LONG_AFTER = 10_000
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("VideoRepick")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("VideoRepick")
 
 
 def spots_of(layout: Layout) -> list[Spot]:

@@ -21,8 +21,8 @@ Hoist = Callable[[Environment, str], Snapshot]
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("VideoUnmask")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("VideoUnmask")
 
 
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)

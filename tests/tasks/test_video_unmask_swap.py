@@ -27,8 +27,8 @@ NUM_PICKS = {"easy": {1, 2}, "medium": {1}, "hard": {2}}
 
 
 @pytest.fixture
-def env(environment: Callable[[str], Environment]) -> Environment:
-    return environment("VideoUnmaskSwap")
+def env(remembering: Callable[[str], Environment]) -> Environment:
+    return remembering("VideoUnmaskSwap")
 
 
 def final_spots(layout: Layout) -> tuple[Spot, ...]:
