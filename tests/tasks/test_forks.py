@@ -157,7 +157,7 @@ def test_only_the_videos_of_a_pair_differ(pair_of: Callable[[str], Pair], name: 
     assert own.shape != twin.shape or not np.array_equal(own, twin)
 
 
-@pytest.mark.parametrize("name", ["PatternLock", "MoveCube", "InsertPeg"])
+@pytest.mark.parametrize("name", each_of(["PatternLock", "MoveCube", "InsertPeg"]))
 def test_after_either_video_the_robot_finds_the_same_world(environment: EnvironmentOf, play: Play, name: str) -> None:
     """From the first observation on it is the same to the bit, and each branch's script succeeds in it."""
     env = environment(name)
@@ -197,7 +197,7 @@ def test_another_world_is_found_only_at_first(environment: EnvironmentOf) -> Non
         env.begin_in(env.save().physics)
 
 
-@pytest.mark.parametrize("name", ["PickXtimes", "SwingXtimes", "StopCube"])
+@pytest.mark.parametrize("name", each_of(["PickXtimes", "SwingXtimes", "StopCube"]))
 def test_a_cut_twin_has_a_whole_round_less_behind_it(pair_of: Callable[[str], Pair], name: str) -> None:
     left = [telling.reasoning.partition("remaining: ")[2][0] for telling in (pair_of(name).own, pair_of(name).twin)]
     assert int(left[1]) > int(left[0])
