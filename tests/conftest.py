@@ -388,15 +388,12 @@ def paper() -> m.Schedule:
 
 @pytest.fixture(scope="module")
 def short_warm_up() -> Iterator[None]:
-    """Real engines in this process measure two answers instead of fifty: in lockstep nobody asks how fast they are."""
-    from ponder_server import engine as ponder_engine
-    from pounce_server import engine as pounce_engine
-
+    """Real engines in this process time one answer as they warm up: in lockstep nobody asks how fast they are."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("NUM_UNMEASURED_FIRES", "NUM_MEASURED_FIRES"):
-            patch.setattr(ponder_engine, name, 1)
+        for name in ("NUM_UNMEASURED_FIRES", "NUM_MEASURED_FIRES", "NUM_FULL_FIRES"):
+            patch.setattr(f"ponder_server.engine.{name}", 1)
         for name in ("WARM_UP_UNMEASURED", "WARM_UP_MEASURED"):
-            patch.setattr(pounce_engine, name, 1)
+            patch.setattr(f"pounce_server.engine.{name}", 1)
         yield
 
 

@@ -37,6 +37,7 @@ from sim_client.ledger import LedgerError
 from sim_client.null_ponder import cognition_shape
 from sim_client.suite import run_seed
 
+pytestmark = pytest.mark.usefixtures("short_warm_up")
 TASKS, EPISODES, RUNS = ("PickXtimes", "StopCube"), 2, 2
 NUM_JOBS = len(TASKS) * EPISODES * RUNS
 
@@ -293,37 +294,47 @@ def test_oracle_episodes_of_two_tasks_end_to_end(tmp_path: Path) -> None:
     assert "0.00 [0.0, 65.8]" in (tmp_path / "tables.md").read_text()
 
 
+SERVED: dict[str, Any] = {
+    "tasks": ("StopCube",), "runs": 1, "policy": "servers", "difficulty": "easy", "max_steps": 25,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Line]]:
+    """The folder and the lines of two recorded episodes of the tiny models."""
+    folder = tmp_path_factory.mktemp("recorded")
+    chosen = options(folder, record=True, **SERVED)
+    with contextlib.closing(EvaluationHarness(chosen)) as harness:
+        return folder, evaluate(chosen, InOrder(harness.play))["episodes"]
+
+
 @pytest.mark.sim
-def test_another_episode_s_cognition_reaches_the_servers(tmp_path: Path) -> None:
-    """Two recorded episodes of the tiny models; then the first again, with what PONDER said in the second."""
-    shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "difficulty": "easy"}
-    shared |= {"max_steps": 25, "record": True}
-    real = options(tmp_path / "real", **shared)
-    with contextlib.closing(EvaluationHarness(real)) as harness:
-        own, donor = evaluate(real, InOrder(harness.play))["episodes"]
-    other = options(tmp_path / "other", cognition="other-episode", donors=tmp_path / "real", **shared)
+def test_another_episode_s_cognition_reaches_the_servers(recorded: tuple[Path, list[Line]], tmp_path: Path) -> None:
+    """The first recorded episode again, with what PONDER said in the second."""
+    real, (own, donor) = recorded
+    other = options(tmp_path, cognition="other-episode", donors=real, record=True, **SERVED)
     with contextlib.closing(EvaluationHarness(other)) as harness:
         given = harness.play(other.jobs()[0])
     assert given["donor"] == Path(donor["mcap"]).name
     assert given["stream_sha256"] != own["stream_sha256"]
     vectors = [
         [cognition.vector.tolist() for cognition in read_log(folder / line["mcap"]).cognitions]
-        for folder, line in ((tmp_path / "real", donor), (tmp_path / "other", given))
+        for folder, line in ((real, donor), (tmp_path, given))
     ]
     assert vectors[0] == vectors[1]
     assert own["models"]["ponder"]["is_untrained"]
 
 
 @pytest.mark.sim
-def test_an_episode_that_is_not_recorded_is_the_same_with_fewer_pictures(tmp_path: Path) -> None:
-    shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "max_steps": 25}
-    lines = []
-    for name, record in (("seen", True), ("unseen", False)):
-        chosen = options(tmp_path / name, record=record, **shared)
-        with contextlib.closing(EvaluationHarness(chosen)) as harness:
-            lines.append(harness.play(chosen.jobs()[0]) | {"mcap": None})
-    assert lines[0] == lines[1]
-    assert lines[0]["stream_sha256"]
+def test_an_episode_that_is_not_recorded_is_the_same_with_fewer_pictures(
+    recorded: tuple[Path, list[Line]], tmp_path: Path
+) -> None:
+    _, (seen, _) = recorded
+    chosen = options(tmp_path, record=False, **SERVED)
+    with contextlib.closing(EvaluationHarness(chosen)) as harness:
+        unseen = harness.play(chosen.jobs()[0])
+    assert unseen == seen | {"mcap": None}
+    assert unseen["stream_sha256"]
 
 
 @pytest.mark.sim

@@ -32,6 +32,7 @@ from sim_client.robot import demonstration
 from sim_client.robot_end import RobotEnd
 from sim_client.suite import Suite
 
+pytestmark = pytest.mark.usefixtures("short_warm_up")
 CODEC = images.wire_codec(is_local=True)
 
 
