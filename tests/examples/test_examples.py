@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 import time
@@ -98,8 +99,14 @@ def test_the_worth_of_memory_is_counted_scene_by_scene(tmp_path: Path) -> None:
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_a_policy_of_one_s_own_moves_the_arm(tmp_path: Path) -> None:
-    told = printed("04_your_own_policy.py", cwd=tmp_path)
+@pytest.mark.usefixtures("short_warm_up")
+def test_a_policy_of_one_s_own_moves_the_arm(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In this process, which has imported everything; the next test runs the file in one of its own."""
+    monkeypatch.setattr(sys, "argv", ["04_your_own_policy.py"])
+    runpy.run_path(str(EXAMPLES / "04_your_own_policy.py"), run_name="__main__")
+    told = capsys.readouterr().out
     low, high = map(float, re.findall(r"[+-]\d\.\d+", told))
     assert told.startswith("40 ticks")
     assert low < -0.05 < 0.05 < high
