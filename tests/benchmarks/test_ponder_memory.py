@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 SMALL = replace(tiny_cpu(), num_layers=4, vision_depth=1, image_px=(64, 64))
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(
     shape=st.fixed_dictionaries(
         {

@@ -87,7 +87,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, pretend: WorkOut) -> dict[st
     order=st.permutations(range(len(TASKS) * EPISODES)),
     steps=st.integers(0, 40),
 )
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_killed_and_resumed_is_as_if_nothing_had_been(
     tmp_path_factory: pytest.TempPathFactory,
     pretend: WorkOut,

@@ -24,7 +24,7 @@ MS = 1_000_000
     wait=st.sampled_from([m.WaitKind.STAND_STILL, m.WaitKind.HOLD]),
     delivery=st.sampled_from([m.DeliveryKind.EVERY, m.DeliveryKind.HELD_TRANSITION, m.DeliveryKind.NULL]),
 )
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_the_same_is_commanded_whether_every_tick_is_looked_at_or_only_those_asked_about(
     new_rig: Callable[..., Any],
     episode_info: Callable[..., m.EpisodeInfo],
