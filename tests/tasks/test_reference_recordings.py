@@ -86,6 +86,11 @@ def played(env: Environment, name: str, actions: Callable[[], Iterable[np.ndarra
 
 
 @pytest.fixture(scope="module")
+def environment(remembering: EnvironmentOf) -> EnvironmentOf:
+    return remembering
+
+
+@pytest.fixture(scope="module")
 def oracles(environment: EnvironmentOf) -> Callable[[str], Episode]:
     """Our oracle in the recorded scene, once per task."""
     return functools.cache(lambda name: played(environment(name), name, environment(name).oracle))
