@@ -42,7 +42,7 @@ def is_open(env: Environment) -> bool:
 
 
 @pytest.mark.parametrize("task", ["PickHighlight", "VideoUnmask"])  # a cube, a container
-@pytest.mark.parametrize("offset", [None, (0, 0, 1), (-1, 1, 0)])
+@pytest.mark.parametrize("offset", [None, (0, 0, 1), pytest.param((-1, 1, 0), marks=pytest.mark.acceptance)])
 @pytest.mark.parametrize("num_steps", [0, 30, 60])
 def test_whenever_it_is_taken_over_the_episode_is_solved(
     environment: Build, task: str, offset: tuple[int, int, int] | None, num_steps: int

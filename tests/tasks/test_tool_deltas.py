@@ -33,7 +33,7 @@ def recorded(env: Environment, seed: int, difficulty: str) -> tuple[np.ndarray, 
     [
         ("PickHighlight", 0, "easy"),
         ("PickHighlight", 1, "medium"),
-        ("PickHighlight", 2, "hard"),
+        pytest.param("PickHighlight", 2, "hard", marks=pytest.mark.acceptance),
         ("PatternLock", 0, "easy"),
     ],
 )
