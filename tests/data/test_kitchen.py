@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dual_system.data import kitchen
-from dual_system.data.collect import collect
+from dual_system.data.collect import MachineOptions, collect
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import DEMO_CAMERA, Package, unpack
 from dual_system.data.kitchen import KitchenOptions, PairJob, record, work_out
@@ -31,17 +33,23 @@ def options(out: Path, **changes: object) -> KitchenOptions:
     return KitchenOptions(out=out, **(given | changes))  # type: ignore[arg-type]
 
 
-class Here:
-    """Works jobs out in this process; dies before the ``dies_at``-th."""
+worked_out = cache(work_out)
 
-    def __init__(self, dies_at: int | None = None) -> None:
-        self._dies_at = dies_at
+
+class Here:
+    """Works jobs out in this process: of a task in ``anew`` once more, others once for this file.
+
+    Dies before the ``dies_at``-th.
+    """
+
+    def __init__(self, dies_at: int | None = None, anew: Sequence[str] = ()) -> None:
+        self._dies_at, self._anew = dies_at, anew
 
     def run(self, jobs: Sequence[PairJob]) -> Iterator[tuple[PairJob, Package]]:
         for place, job in enumerate(jobs):
             if place == self._dies_at:
                 raise KeyboardInterrupt
-            yield job, work_out(job)
+            yield job, work_out(job) if job.task in self._anew else worked_out(job)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +75,7 @@ def test_a_pair_holds_both_bodies_from_one_start(collected: Path) -> None:
         assert set(rows.grounded_subgoal[start:]) == {entry.instruction}
         first, last = (views[0] for views in dataset.views(entry, [0, start - 1]))
         assert np.abs(first.astype(int) - last).mean() > 0.5  # the body moved
-        with KitchenEnvironment(entry.task, image_px=PX) as environment:
+        with KitchenEnvironment(entry.task, render=False) as environment:
             begun = environment.reset(entry.seed)
             for row in range(start, entry.num_rows):  # what is stored, played again, is the same and reaches the goal
                 np.testing.assert_array_equal(rows.state[row], begun.state)
@@ -79,16 +87,25 @@ def test_a_killed_collection_goes_on_to_the_same_bytes(collected: Path, tmp_path
     again = options(tmp_path / "set", tasks=("CloseDrawer", "OpenDrawer"))
     with pytest.raises(KeyboardInterrupt):
         collect(again, Here(dies_at=1))
-    collect(again, Here())
+    collect(again, Here(anew=["OpenDrawer"]))
     files = [path.relative_to(collected) for path in sorted(collected.rglob("*")) if path.is_file()]
     assert len(files) > 5
     for name in files:
         assert (collected / name).read_bytes() == (tmp_path / "set" / name).read_bytes(), name
 
 
-def test_the_command_writes_the_splits(tmp_path: Path) -> None:
+def test_the_command_writes_the_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[MachineOptions] = []
+
+    def here(machine: MachineOptions, work_out: Callable[[PairJob], Package]) -> Here:
+        ForkingPickler.dumps((work_out, options(tmp_path).jobs()))  # as a worker's process would get them
+        asked.append(machine)
+        return Here()
+
+    monkeypatch.setattr(kitchen, "workers_on", here)
     arguments = ["--out", str(tmp_path), "--tasks", "CloseDrawer", "--episodes", "1", "--image-px", str(PX)]
-    assert kitchen.main([*arguments, "--invocation-hz", "1", "--workers", "1", "--no-progress"]) == 0
+    assert kitchen.main([*arguments, "--invocation-hz", "4", "--workers", "1", "--no-progress"]) == 0
+    assert [machine.workers for machine in asked] == [1]
     splits = json.loads((tmp_path / SPLITS_PATH).read_text())
     assert splits["category_balanced"]["unseen"] == {"tasks": ["CloseDrawer"], "episodes": [0]}
     assert splits["precision_sensitive"]["seen"] == {"tasks": ["CloseDrawer"], "episodes": [0]}
