@@ -16,7 +16,7 @@ from dual_system.data.jobs import Look, jobs_of
 from dual_system.data.rollout import work_out
 from dual_system.data.workers import LocalWorkers, RayWorkers
 
-JOBS = list(jobs_of(("StopCube",), 4, image_px=16, max_steps=1300, look=Look(execution_hz=1)))
+JOBS = list(jobs_of(("StopCube",), 2, image_px=16, max_steps=1300, look=Look(execution_hz=1)))
 
 
 @pytest.mark.e2e
