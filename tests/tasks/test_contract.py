@@ -245,7 +245,7 @@ def test_the_oracle_can_take_over_anywhere(walk: WalkOf, environment: Environmen
     """Taking over stops the arm, and in the last two seconds a task that is a matter of timing has none to lose."""
     env = environment(name)
     saved = saved_at(walk(name, "hard")[:-41])
-    handover, state = saved[min(13, len(saved) - 1)]
+    handover, state = saved[len(saved) * 2 // 3]
     env.restore(state)
     for action in env.oracle():
         snapshot = env.step(action)
