@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.write(f"{task}: {sum(e['success'] for e in played)} of {len(played)}{left_out}\n")
     broken_off = Counter(each["reason"] for each in all_played if each["status"] == m.TaskStatus.ABORTED.name)
     for reason, number in broken_off.most_common():
-        sys.stdout.write(f"broken off: {number}, {reason}\n")
+        sys.stdout.write(f"{number} broken off: {reason}\n")
     folder = shlex.quote(str(options.out))
     sys.stdout.write(f"{options.out / 'results.json'}; tables: pp-tables {folder} --out {folder}\n")
     return DONE

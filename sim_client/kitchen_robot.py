@@ -20,8 +20,8 @@ _UNITS = {
     "torso": "0.05 m a tick",
     "mode": "above 0 the base moves",
 }
-_TURN_RAD = 4.0  # the wrist turns to 3.75
-_LARGEST = {"joint_pos": _TURN_RAD, "cos": 1.001, "sin": 1.001, "quat": 1.001, "gripper_qpos": 0.1, "gripper_qvel": 5.0}
+# A wrist turns to 3.75 rad, and a little further under load.
+_LARGEST = {"joint_pos": 4.0, "cos": 1.001, "sin": 1.001, "quat": 1.001, "gripper_qpos": 0.1, "gripper_qvel": 5.0}
 _LARGEST_ELSE = 50.0  # m, m/s and rad/s: only what is no number of this robot is refused
 _STOP_TICKS = 2
 

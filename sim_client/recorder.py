@@ -43,7 +43,7 @@ class Recorder:
         self.stamps: list[m.Stamp] = []
         self.invocations: list[m.Invocation] = []
         self.last_error = ""
-        """What the episode's last error says, other than that the ladder goes down: that one is its cause."""
+        """What the episode's last error says. The ladder's steps down are left out: an error leads to them."""
         self._answered: set[tuple[m.StampKind, int]] = set()
 
     def begin(self, info: m.EpisodeInfo, path: Path | None) -> None:

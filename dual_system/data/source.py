@@ -65,7 +65,7 @@ NO_PICTURE = -1
 
 
 def paired(episode: SourceEpisode, source: Path) -> SourceEpisode:
-    """An episode of ``source`` whose rows show what their action led to, as one of rows that show what was seen before.
+    """Returns an episode of ``source``, whose rows show what their action led to, as rows of what was seen before it.
 
     What a row shows goes with the next row's action, and so do the texts, which are of that action; what the last
     action led to has no row. Raises DatasetError if there is one row.

@@ -176,9 +176,9 @@ class Physics:
         body = self.model.body(name).id
         wrench = np.empty(6)
         contacts = self.data.contact
-        bodies_n2 = self.model.geom_bodyid[contacts.geom]
-        for index in np.flatnonzero((bodies_n2 == body).any(axis=1)):
-            first, second = map(int, bodies_n2[index])
+        bodies_C2 = self.model.geom_bodyid[contacts.geom]
+        for index in np.flatnonzero((bodies_C2 == body).any(axis=1)):
+            first, second = map(int, bodies_C2[index])
             finger = self._owner.get(second if first == body else first)
             if finger is None:
                 continue

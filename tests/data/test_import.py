@@ -106,7 +106,7 @@ def test_what_an_action_led_to_goes_before_the_next_one(rows: int) -> None:
 
 
 def test_one_row_has_no_pair() -> None:
-    with pytest.raises(DatasetError, match="1 row"):
+    with pytest.raises(DatasetError, match=r"^set: episode \d+: 1 row"):
         paired(episode(1), Path("set"))
 
 

@@ -21,9 +21,6 @@ _SECRET = re.compile(
     r"-----BEGIN [A-Z ]*PRIVATE KEY|\bgh[pousr]_[A-Za-z0-9]{30}|\bhf_[A-Za-z0-9]{30}|\bAKIA[0-9A-Z]{16}|://[^/\s:@]+:[^/\s:@]+@"
 )
 
-_DOCSTRING = re.compile(r"(?:\s*#.*\n|\s*\n)*[rR]?(?:\"\"\"|'''|\"|')\s*[^\s\"']")
-"""A module's first statement, which need not be parsed to be found."""
-
 MAX_TREE_MIB = 48
 """Limit of the tracked files: a borrowed GPU takes a tree of 64 MiB, with what a run carries besides."""
 
@@ -46,23 +43,14 @@ def test_the_tree_can_travel_to_a_gpu(root: Path, files: tuple[str, ...]) -> Non
 
 
 def test_every_module_says_in_a_docstring_what_it_is(root: Path, written: tuple[str, ...]) -> None:
-    sources = {name: (root / name).read_text(encoding="utf-8") for name in written}
-    assert not [name for name, source in sources.items() if source.strip() and not _DOCSTRING.match(source)]
-
-
-@pytest.mark.parametrize(
-    ("source", "is_found"),
-    [
-        ('"""A module."""\n', True),
-        ("#!/usr/bin/env python\n\n# For users.\n'A module.'\n", True),
-        ('x = """no docstring"""\n', False),
-        ('# none\nimport x\n\n"""no docstring"""\n', False),
-        ('""" """\n', False),
-    ],
-)
-def test_a_module_s_docstring_is_recognised(source: str, is_found: bool) -> None:
-    assert bool(_DOCSTRING.match(source)) is is_found
-    assert bool(ast.get_docstring(ast.parse(source))) is is_found
+    silent = []
+    for name in written:
+        source = (root / name).read_text(encoding="utf-8")
+        if not source.strip() or re.match(r'"""[^\s"]', source):
+            continue  # to parse all takes seconds
+        if not ast.get_docstring(ast.parse(source)):
+            silent.append(name)
+    assert not silent
 
 
 def test_a_long_class_says_why_it_is_one_idea(root: Path, written: tuple[str, ...]) -> None:

@@ -149,4 +149,4 @@ def test_a_scene_without_a_demonstration_is_a_line_and_no_error(
     assert evaluate.main(["--out", str(tmp_path), *arguments]) == evaluate.DONE
     told = capsys.readouterr().out
     assert "OpenDrawer: 1 of 2 (2 more have no demonstration)" in told
-    assert "broken off: 1, no way\n" in told
+    assert "1 broken off: no way\n" in told

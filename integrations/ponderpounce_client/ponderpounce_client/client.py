@@ -97,8 +97,8 @@ class Client:
         self._url, self._patience_s, self._silence_s = url, patience_s, silence_s
         self._seq, self._has_command = 0, False
         self._opened = contextlib.ExitStack()
-        options: dict[str, Any] = {"compression": None, "max_size": None, "close_timeout": _CLOSE_S}
-        options["open_timeout"] = min(10.0, patience_s)
+        options: dict[str, Any] = {"compression": None, "max_size": None}
+        options |= {"open_timeout": min(10.0, patience_s), "close_timeout": _CLOSE_S}
         if "proxy" in inspect.signature(connect).parameters:  # a robot is not reached through a proxy for the web
             options["proxy"] = None
         if api_key:

@@ -108,19 +108,18 @@ class Client:
 
     def answer(self, question: dict[str, Any]) -> dict[str, Any]:
         channel = self.answers if question["message_type"] == "observation" else self.texts
-        until_s = time.monotonic() + 10
-        while time.monotonic() < until_s:
-            sample = channel.try_recv()
-            if sample is None:
-                time.sleep(0.002)
-                continue
-            answer = msgpack.unpackb(sample.payload.to_bytes())
-            if [answer[name] for name in ("request_id", "generation")] == [
-                question["request_id"],
-                question["generation"],
-            ]:
-                return answer
-        pytest.fail("no answer within 10 s")
+        answers: list[dict[str, Any]] = []
+
+        def is_answered() -> bool:
+            while (sample := channel.try_recv()) is not None:
+                answers.append(msgpack.unpackb(sample.payload.to_bytes()))
+            return any(is_it(answer) for answer in answers)
+
+        def is_it(answer: dict[str, Any]) -> bool:
+            return all(answer[name] == question[name] for name in ("request_id", "generation"))
+
+        until(is_answered)
+        return next(filter(is_it, answers))
 
     def infer(self, **changes: Any) -> np.ndarray:
         """Rows in degrees, (ROWS, 3), validated as LeRobot validates them."""
